@@ -1,0 +1,102 @@
+//! Questions to the simulator that only the scenario runner may ask.
+
+use crate::{imaging::ImageData, target::Target, wire};
+use serde::{Deserialize, Serialize};
+
+/// Question to `sim/truth/score`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ScoreRequest {
+    /// The target as it was selected.
+    pub target: Target,
+    /// Encoder angles of the purely kinematic placement on the believed target, rad.
+    pub open_loop_joints_rad: Option<Vec<f64>>,
+}
+
+/// The placement measured against the truth. A quantity that does not exist is absent.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Score {
+    /// True surface point seen at the designated pixel, world frame, m.
+    pub target_in_world_m: [f64; 3],
+    /// True surface normal there.
+    pub normal_in_world: [f64; 3],
+    /// First touch of the instrument on the terrain, world frame, m.
+    pub contact_in_world_m: Option<[f64; 3]>,
+    /// Distance between the two in the plane of the true normal, mm.
+    pub lateral_error_mm: Option<f64>,
+    /// Distance between the two along the true normal, mm.
+    pub range_error_mm: Option<f64>,
+    /// Angle between the instrument's axis at contact and the true inward normal, deg.
+    pub axis_error_deg: Option<f64>,
+    /// The lateral error of a purely kinematic placement, mm.
+    pub open_loop_lateral_error_mm: Option<f64>,
+    /// Distance between believed and true tip at the present encoder angles, mm, mount error
+    /// included.
+    pub arm_model_error_mm: f64,
+    /// Distance between the believed target and the true one, mm, mount error removed.
+    pub target_error_mm: f64,
+}
+
+/// Question to `sim/truth/view`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ViewRequest {
+    /// Position of the outside camera, world frame, m.
+    pub eye_m: [f64; 3],
+    /// Point that it looks at, world frame, m.
+    pub look_at_m: [f64; 3],
+    /// Columns, px.
+    pub width_px: u32,
+    /// Rows, px.
+    pub height_px: u32,
+    /// Horizontal field of view, deg.
+    pub field_of_view_deg: f64,
+}
+
+/// Answer of `sim/truth/view`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct View {
+    /// What the outside camera sees.
+    pub image: ImageData,
+}
+
+/// Answer of `sim/truth/state`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TruthState {
+    /// Simulated time, s.
+    pub sim_time_s: f64,
+    /// True tip position, world frame, m.
+    pub tip_in_world_m: [f64; 3],
+    /// True joint angles, rad.
+    pub joints_rad: Vec<f64>,
+    /// Seconds of computing so far by kind: physics, rendering.
+    pub physics_wall_s: f64,
+    /// Rendering, s of wall time.
+    pub rendering_wall_s: f64,
+    /// Physics steps so far.
+    pub steps: u64,
+}
+
+/// A fault that the simulator can be told to show.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum InjectedFault {
+    /// The fiducial's pattern vanishes (covered by dust) or comes back.
+    FiducialHidden(bool),
+    /// The rock with this index vanishes.
+    RockVanishes(u32),
+    /// The contact switch no longer closes.
+    SwitchDead(bool),
+}
+
+wire! {
+    ScoreRequest = "score_request/1",
+    Score = "score/1",
+    ViewRequest = "view_request/1",
+    View = "view/1",
+    TruthState = "truth_state/1",
+    InjectedFault = "injected_fault/1",
+}

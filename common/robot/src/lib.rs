@@ -1,0 +1,16 @@
+//! The robot as its users describe it: one TOML file with arm, tool, fiducial, cameras, shape,
+//! postures and stated calibration quality. Services believe it; the simulator perturbs its own
+//! copy.
+//!
+//! Every field is checked when a file is read and the message names the field, what was found and
+//! what was expected; unknown fields are refused.
+
+mod description;
+mod robot;
+
+pub use description::{
+    ArmDescription, CameraPairDescription, Capsule, ContactSwitch, Dynamics, FiducialDescription,
+    JointDescription, LinkDynamics, ModelQuality, PoseDescription, RobotDescription,
+    ToolDescription,
+};
+pub use robot::{Robot, RobotError};

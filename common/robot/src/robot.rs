@@ -1,0 +1,361 @@
+//! The checked robot and what is derived from its description.
+
+use crate::{CameraPairDescription, Capsule, PoseDescription, RobotDescription};
+use nalgebra::{Isometry3, Matrix3, Rotation3, Unit, UnitQuaternion, Vector3};
+use rover_geometry::{ArmBase, Link, Rover, Transform};
+use rover_kinematics::{Arm, DhRow, JointLimits, Tool};
+use sha2::{Digest, Sha256};
+use std::path::Path;
+
+/// Why a robot description cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RobotError {
+    /// The file could not be read.
+    #[error("{path}: {source}")]
+    File {
+        /// The file.
+        path: String,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The text is not a robot description; the message has line and column.
+    #[error("{origin}: {message}")]
+    Syntax {
+        /// Where the text came from.
+        origin: String,
+        /// What the parser found and expected.
+        message: String,
+    },
+    /// A field has a value that cannot be.
+    #[error("{origin}: {field}: {message}")]
+    Field {
+        /// Where the text came from.
+        origin: String,
+        /// The field's path.
+        field: String,
+        /// What was found and what was expected.
+        message: String,
+    },
+    /// A name that the robot does not have.
+    #[error("no {kind} named `{name}`; the robot has: {known}")]
+    Unknown {
+        /// What was looked for.
+        kind: &'static str,
+        /// The name asked for.
+        name: String,
+        /// The names there are.
+        known: String,
+    },
+}
+
+/// A robot as the services believe it to be.
+#[derive(Clone, Debug)]
+pub struct Robot {
+    description: RobotDescription,
+    /// The arm's kinematics, arm base frame.
+    pub arm: Arm,
+    /// Tip and approach axis, last link frame.
+    pub tool: Tool,
+    /// Pose of the arm's base.
+    pub rover_from_arm_base: Transform<Rover, ArmBase>,
+    /// Pose of the fiducial plate's frame (x right, y up, z out of the front) on the last link.
+    pub link_from_plate: Isometry3<f64>,
+    configuration_sha256: String,
+}
+
+impl Robot {
+    /// Reads and checks a robot file.
+    ///
+    /// # Errors
+    /// [`RobotError`] with file, field, what was found and what was expected.
+    pub fn read(path: &Path) -> Result<Self, RobotError> {
+        let origin = path.display().to_string();
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| RobotError::File { path: origin.clone(), source })?;
+        Self::parse(&text, &origin)
+    }
+
+    /// Checks a robot description given as TOML text; `origin` is named in errors.
+    ///
+    /// # Errors
+    /// As [`Robot::read`].
+    pub fn parse(text: &str, origin: &str) -> Result<Self, RobotError> {
+        let description = toml::from_str(text).map_err(|e| RobotError::Syntax {
+            origin: origin.into(),
+            message: e.to_string(),
+        })?;
+        Self::new(description, origin)
+    }
+
+    /// Checks a description.
+    ///
+    /// # Errors
+    /// [`RobotError::Field`].
+    pub fn new(description: RobotDescription, origin: &str) -> Result<Self, RobotError> {
+        let check = Check { origin };
+        check.all(&description)?;
+        let (rows, limits): (Vec<_>, Vec<_>) = description
+            .arm
+            .joints
+            .iter()
+            .map(|j| {
+                let row = DhRow {
+                    a_m: j.a_m,
+                    alpha_rad: j.alpha_rad,
+                    d_m: j.d_m,
+                    theta_offset_rad: j.theta_offset_rad,
+                };
+                let limits = JointLimits {
+                    lower_rad: j.lower_rad,
+                    upper_rad: j.upper_rad,
+                    max_rate_rad_s: j.max_rate_rad_s,
+                    max_acceleration_rad_s2: j.max_acceleration_rad_s2,
+                };
+                (row, limits)
+            })
+            .unzip();
+        let arm = Arm::new(rows, limits).map_err(|e| check.error("arm.joints", e.to_string()))?;
+        let tool = Tool {
+            tip_in_link: description.tool.tip_m.into(),
+            axis_in_link: check.direction("tool.axis", description.tool.axis)?,
+        };
+        let link_from_plate = check.plate(&description)?;
+        let text = toml::to_string(&description)
+            .map_err(|e| check.error("robot", format!("cannot be written as TOML: {e}")))?;
+        let configuration_sha256 =
+            Sha256::digest(text.as_bytes()).iter().map(|b| format!("{b:02x}")).collect();
+        Ok(Self {
+            arm,
+            tool,
+            rover_from_arm_base: pose(&description.arm.base).into(),
+            link_from_plate,
+            configuration_sha256,
+            description,
+        })
+    }
+
+    /// The description with every default filled in.
+    pub fn description(&self) -> &RobotDescription {
+        &self.description
+    }
+
+    /// SHA-256 of the effective description, hexadecimal.
+    pub fn configuration_sha256(&self) -> &str {
+        &self.configuration_sha256
+    }
+
+    /// Name of the robot and namespace of its keys.
+    pub fn name(&self) -> &str {
+        &self.description.name
+    }
+
+    /// The camera pair of that name.
+    ///
+    /// # Errors
+    /// [`RobotError::Unknown`] with the names there are.
+    pub fn pair(&self, name: &str) -> Result<&CameraPairDescription, RobotError> {
+        self.description.cameras.iter().find(|p| p.name == name).ok_or_else(|| {
+            RobotError::Unknown {
+                kind: "camera pair",
+                name: name.into(),
+                known: list(self.description.cameras.iter().map(|p| p.name.as_str())),
+            }
+        })
+    }
+
+    /// The joint angles of a named posture, rad.
+    ///
+    /// # Errors
+    /// [`RobotError::Unknown`] with the names there are.
+    pub fn posture(&self, name: &str) -> Result<&[f64], RobotError> {
+        self.description.postures.get(name).map(Vec::as_slice).ok_or_else(|| {
+            RobotError::Unknown {
+                kind: "posture",
+                name: name.into(),
+                known: list(self.description.postures.keys().map(String::as_str)),
+            }
+        })
+    }
+
+    /// Pose of the last link for joint angles `q` (rad).
+    ///
+    /// # Errors
+    /// [`rover_kinematics::ArmError`] for a wrong number of joints or a non-finite angle.
+    pub fn rover_from_link(
+        &self,
+        q: &[f64],
+    ) -> Result<Transform<Rover, Link>, rover_kinematics::ArmError> {
+        let base_from_link: Transform<ArmBase, Link> = self.arm.forward(q)?.into();
+        Ok(self.rover_from_arm_base * base_from_link)
+    }
+
+    /// Centre about which the mount error of the camera pairs is parametrised: the mean of the
+    /// first pair's camera centres, rover frame, m.
+    pub fn mount_centre(&self) -> Vector3<f64> {
+        let pair = &self.description.cameras[0].cameras;
+        (pair.left.centre() + pair.right.centre()) / 2.0
+    }
+}
+
+/// The isometry of a described pose.
+pub(crate) fn pose(p: &PoseDescription) -> Isometry3<f64> {
+    let [r, pt, y] = p.rpy_deg.map(f64::to_radians);
+    Isometry3::from_parts(Vector3::from(p.xyz_m).into(), UnitQuaternion::from_euler_angles(r, pt, y))
+}
+
+fn list<'a>(names: impl Iterator<Item = &'a str>) -> String {
+    names.collect::<Vec<_>>().join(", ")
+}
+
+struct Check<'a> {
+    origin: &'a str,
+}
+
+impl Check<'_> {
+    fn error(&self, field: &str, message: impl Into<String>) -> RobotError {
+        RobotError::Field {
+            origin: self.origin.into(),
+            field: field.into(),
+            message: message.into(),
+        }
+    }
+
+    fn require(&self, ok: bool, field: &str, message: impl Into<String>) -> Result<(), RobotError> {
+        if ok { Ok(()) } else { Err(self.error(field, message)) }
+    }
+
+    fn positive(&self, field: &str, value: f64) -> Result<(), RobotError> {
+        self.require(
+            value.is_finite() && value > 0.0,
+            field,
+            format!("{value}, expected a positive number"),
+        )
+    }
+
+    fn direction(&self, field: &str, v: [f64; 3]) -> Result<Unit<Vector3<f64>>, RobotError> {
+        Unit::try_new(Vector3::from(v), 1e-9)
+            .filter(|u| u.iter().all(|x| x.is_finite()))
+            .ok_or_else(|| self.error(field, format!("{v:?}, expected a direction other than zero")))
+    }
+
+    fn capsules(&self, field: &str, capsules: &[Capsule]) -> Result<(), RobotError> {
+        for (i, c) in capsules.iter().enumerate() {
+            self.positive(&format!("{field}[{i}].radius_m"), c.radius_m)?;
+            let ends = c.from_m.iter().chain(&c.to_m);
+            self.require(
+                ends.clone().all(|x| x.is_finite()),
+                &format!("{field}[{i}]"),
+                "an end is not finite",
+            )?;
+        }
+        Ok(())
+    }
+
+    fn all(&self, d: &RobotDescription) -> Result<(), RobotError> {
+        let named = !d.name.is_empty()
+            && d.name.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_');
+        self.require(
+            named,
+            "name",
+            format!("`{}`, expected lower-case letters, digits and `_`", d.name),
+        )?;
+        self.positive("model_quality.angle_deg", d.model_quality.angle_deg)?;
+        self.positive("model_quality.length_mm", d.model_quality.length_mm)?;
+        self.positive("arm.heartbeat_s", d.arm.heartbeat_s)?;
+        self.require(
+            d.arm.heartbeat_s <= 0.05,
+            "arm.heartbeat_s",
+            format!("{}, expected at most 0.05 s", d.arm.heartbeat_s),
+        )?;
+        for (i, j) in d.arm.joints.iter().enumerate() {
+            self.capsules(&format!("arm.joints[{i}].shape"), &j.shape)?;
+        }
+        self.capsules("body", &d.body)?;
+        let s = &d.tool.switch;
+        for (field, value) in [
+            ("tool.switch.ball_radius_m", s.ball_radius_m),
+            ("tool.switch.closes_at_m", s.closes_at_m),
+            ("tool.switch.spring_n_m", s.spring_n_m),
+            ("tool.switch.preload_n", s.preload_n),
+        ] {
+            self.positive(field, value)?;
+        }
+        self.require(
+            s.travel_m > s.closes_at_m,
+            "tool.switch.travel_m",
+            format!("{}, expected more than closes_at_m = {}", s.travel_m, s.closes_at_m),
+        )?;
+        self.require(!d.cameras.is_empty(), "cameras", "none, expected at least one pair")?;
+        for pair in &d.cameras {
+            for (side, camera) in [("left", &pair.cameras.left), ("right", &pair.cameras.right)] {
+                camera.validate().map_err(|e| {
+                    self.error(&format!("cameras.{}.{side}", pair.name), e.to_string())
+                })?;
+            }
+            self.positive(&format!("cameras.{}.range_min_m", pair.name), pair.range_min_m)?;
+            self.require(
+                pair.range_max_m > pair.range_min_m,
+                &format!("cameras.{}.range_max_m", pair.name),
+                format!("{}, expected more than range_min_m", pair.range_max_m),
+            )?;
+        }
+        self.postures(d)?;
+        self.dynamics(d)
+    }
+
+    fn postures(&self, d: &RobotDescription) -> Result<(), RobotError> {
+        for (name, q) in &d.postures {
+            let field = format!("postures.{name}");
+            self.require(
+                q.len() == d.arm.joints.len(),
+                &field,
+                format!("{} angles, expected {}", q.len(), d.arm.joints.len()),
+            )?;
+            for (joint, &angle) in d.arm.joints.iter().zip(q) {
+                self.require(
+                    (joint.lower_rad..=joint.upper_rad).contains(&angle),
+                    &field,
+                    format!(
+                        "{angle} rad for joint `{}`, expected {} to {}",
+                        joint.name, joint.lower_rad, joint.upper_rad
+                    ),
+                )?;
+            }
+        }
+        Ok(())
+    }
+
+    fn dynamics(&self, d: &RobotDescription) -> Result<(), RobotError> {
+        let Some(dynamics) = &d.dynamics else { return Ok(()) };
+        self.require(
+            dynamics.links.len() == d.arm.joints.len(),
+            "dynamics.links",
+            format!("{}, expected one per joint ({})", dynamics.links.len(), d.arm.joints.len()),
+        )?;
+        for (i, link) in dynamics.links.iter().enumerate() {
+            for (field, value) in [
+                ("mass_kg", link.mass_kg),
+                ("stiffness_nm_rad", link.stiffness_nm_rad),
+                ("damping_nms_rad", link.damping_nms_rad),
+                ("max_torque_nm", link.max_torque_nm),
+                ("inertia_kg_m2", link.inertia_kg_m2.iter().copied().fold(f64::MAX, f64::min)),
+            ] {
+                self.positive(&format!("dynamics.links[{i}].{field}"), value)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn plate(&self, d: &RobotDescription) -> Result<Isometry3<f64>, RobotError> {
+        let f = &d.fiducial;
+        f.layout.validate().map_err(|e| self.error("fiducial.layout", e.to_string()))?;
+        let z = self.direction("fiducial.normal", f.normal)?.into_inner();
+        let right = Vector3::from(f.right);
+        let x = self
+            .direction("fiducial.right", (right - z * z.dot(&right)).into())?
+            .into_inner();
+        let axes = Matrix3::from_columns(&[x, z.cross(&x), z]);
+        let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
+        Ok(Isometry3::from_parts(Vector3::from(f.centre_m).into(), rotation))
+    }
+}
