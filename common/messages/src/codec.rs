@@ -131,7 +131,11 @@ pub fn encoding_of(schema: &str, format: Format) -> String {
 
 /// Format in which somebody who marked his payload with `encoding` wants to be answered.
 pub fn format_of(encoding: &str) -> Format {
-    if media_type(encoding) == BINCODE { Format::Bincode } else { Format::Json }
+    if media_type(encoding) == BINCODE {
+        Format::Bincode
+    } else {
+        Format::Json
+    }
 }
 
 /// Checks the mark of a payload against the expected schema and says how to decode it.
@@ -178,9 +182,10 @@ fn media_type(encoding: &str) -> &str {
 /// [`CodecError::Invalid`] if its own check refuses it or a number is not finite,
 /// [`CodecError::TooLarge`] above [`MAX_PAYLOAD_BYTES`].
 pub fn encode<T: Wire>(message: &T, format: Format) -> Result<Vec<u8>, CodecError> {
-    message
-        .validate()
-        .map_err(|reason| CodecError::Invalid { schema: T::SCHEMA.to_owned(), reason })?;
+    message.validate().map_err(|reason| CodecError::Invalid {
+        schema: T::SCHEMA.to_owned(),
+        reason,
+    })?;
     encode_value(message, T::SCHEMA, format)
 }
 
@@ -190,9 +195,10 @@ pub fn encode<T: Wire>(message: &T, format: Format) -> Result<Vec<u8>, CodecErro
 /// See [`CodecError`]; nothing is decoded from a payload that is too large.
 pub fn decode<T: Wire>(bytes: &[u8], format: Format, limit: usize) -> Result<T, CodecError> {
     let message: T = decode_value(bytes, T::SCHEMA, format, limit)?;
-    message
-        .validate()
-        .map_err(|reason| CodecError::Invalid { schema: T::SCHEMA.to_owned(), reason })?;
+    message.validate().map_err(|reason| CodecError::Invalid {
+        schema: T::SCHEMA.to_owned(),
+        reason,
+    })?;
     Ok(message)
 }
 
@@ -200,11 +206,7 @@ pub fn decode<T: Wire>(bytes: &[u8], format: Format, limit: usize) -> Result<T, 
 ///
 /// # Errors
 /// See [`CodecError`].
-pub fn decode_marked<T: Wire>(
-    bytes: &[u8],
-    encoding: &str,
-    limit: usize,
-) -> Result<T, CodecError> {
+pub fn decode_marked<T: Wire>(bytes: &[u8], encoding: &str, limit: usize) -> Result<T, CodecError> {
     decode(bytes, check_encoding(encoding, T::SCHEMA)?, limit)
 }
 
@@ -218,16 +220,20 @@ pub fn encode_value<T: Serialize>(
     schema: &str,
     format: Format,
 ) -> Result<Vec<u8>, CodecError> {
-    check_finite(value)
-        .map_err(|e| CodecError::Invalid { schema: schema.to_owned(), reason: e.to_string() })?;
+    check_finite(value).map_err(|e| CodecError::Invalid {
+        schema: schema.to_owned(),
+        reason: e.to_string(),
+    })?;
     let bytes = match format {
-        Format::Bincode => {
-            bincode::serde::encode_to_vec(value, bincode::config::standard())
-                .map_err(|e| e.to_string())
-        }
+        Format::Bincode => bincode::serde::encode_to_vec(value, bincode::config::standard())
+            .map_err(|e| e.to_string()),
         Format::Json => serde_json::to_vec(value).map_err(|e| e.to_string()),
     }
-    .map_err(|reason| CodecError::Unencodable { schema: schema.to_owned(), format, reason })?;
+    .map_err(|reason| CodecError::Unencodable {
+        schema: schema.to_owned(),
+        format,
+        reason,
+    })?;
     check_size(bytes.len(), schema, MAX_PAYLOAD_BYTES)?;
     Ok(bytes)
 }
@@ -274,7 +280,11 @@ pub fn decode_value<T: DeserializeOwned + Serialize>(
 
 fn check_size(found: usize, schema: &str, limit: usize) -> Result<(), CodecError> {
     if found > limit {
-        return Err(CodecError::TooLarge { schema: schema.to_owned(), found, limit });
+        return Err(CodecError::TooLarge {
+            schema: schema.to_owned(),
+            found,
+            limit,
+        });
     }
     Ok(())
 }
@@ -307,7 +317,10 @@ pub mod bytes_or_base64 {
         if from.is_human_readable() {
             let text = String::deserialize(from)?;
             let bytes = STANDARD.decode(text.as_bytes()).map_err(|e| {
-                D::Error::custom(format!("text of {} characters is not base64: {e}", text.len()))
+                D::Error::custom(format!(
+                    "text of {} characters is not base64: {e}",
+                    text.len()
+                ))
             })?;
             Ok(bytes.into())
         } else {

@@ -26,7 +26,10 @@ impl std::error::Error for NotFinite {}
 
 impl ser::Error for NotFinite {
     fn custom<T: fmt::Display>(message: T) -> Self {
-        Self { steps: Vec::new(), found: message.to_string() }
+        Self {
+            steps: Vec::new(),
+            found: message.to_string(),
+        }
     }
 }
 
@@ -95,7 +98,10 @@ impl ser::Serializer for Walk {
         if v.is_finite() {
             Ok(())
         } else {
-            Err(NotFinite { steps: Vec::new(), found: v.to_string() })
+            Err(NotFinite {
+                steps: Vec::new(),
+                found: v.to_string(),
+            })
         }
     }
     fn serialize_some<T: Serialize + ?Sized>(self, value: &T) -> Result<(), NotFinite> {

@@ -30,7 +30,11 @@ struct Checked {
 impl Wire for Checked {
     const SCHEMA: &'static str = "checked/1";
     fn validate(&self) -> Result<(), String> {
-        if self.count == 0 { Err("count: 0, expected 1 or more".into()) } else { Ok(()) }
+        if self.count == 0 {
+            Err("count: 0, expected 1 or more".into())
+        } else {
+            Ok(())
+        }
     }
 }
 
@@ -46,8 +50,18 @@ fn both_formats_give_back_the_same_message() {
 
 #[test]
 fn floats_survive_json_bit_for_bit() {
-    for x in [0.1 + 0.2, f64::MIN_POSITIVE, 5e-324, f64::MAX, -0.0, 1.0 / 3.0] {
-        let message = Reading { position_m: [x; 3], ..reading() };
+    for x in [
+        0.1 + 0.2,
+        f64::MIN_POSITIVE,
+        5e-324,
+        f64::MAX,
+        -0.0,
+        1.0 / 3.0,
+    ] {
+        let message = Reading {
+            position_m: [x; 3],
+            ..reading()
+        };
         let bytes = encode(&message, Format::Json).unwrap();
         let back: Reading = decode(&bytes, Format::Json, MAX_PAYLOAD_BYTES).unwrap();
         assert_eq!(back.position_m[0].to_bits(), x.to_bits());
@@ -62,7 +76,10 @@ fn binary_layout_is_frozen() {
         0, 0xF0, 0x3F,
     ];
     assert_eq!(encode(&fault, Format::Bincode).unwrap(), expected);
-    assert_eq!(encode(&Nothing {}, Format::Bincode).unwrap(), Vec::<u8>::new());
+    assert_eq!(
+        encode(&Nothing {}, Format::Bincode).unwrap(),
+        Vec::<u8>::new()
+    );
     let pixels: &[u8] = &encode(&reading(), Format::Bincode).unwrap()[24..];
     assert_eq!(pixels[..5], [4, 0, 1, 254, 255]);
 }
@@ -79,15 +96,25 @@ fn pixels_are_base64_in_json() {
 #[test]
 fn wrong_name_or_version_is_refused_with_found_and_expected() {
     let bytes = encode(&reading(), Format::Bincode).unwrap();
-    for mark in ["application/bincode;reading/1", "application/bincode;other/2", BINCODE] {
+    for mark in [
+        "application/bincode;reading/1",
+        "application/bincode;other/2",
+        BINCODE,
+    ] {
         let e = decode_marked::<Reading>(&bytes, mark, 1000).unwrap_err();
         assert_eq!(e.fault_name(), "wrong_version");
         let text = e.to_string();
-        assert!(text.contains(mark) && text.contains("application/bincode;reading/2"), "{text}");
+        assert!(
+            text.contains(mark) && text.contains("application/bincode;reading/2"),
+            "{text}"
+        );
     }
     let e = check_encoding("application/json;reading/1", "reading/2").unwrap_err();
     assert_eq!(e.fault_name(), "wrong_version");
-    assert_eq!(check_encoding("application/json;reading/2", "reading/2"), Ok(Format::Json));
+    assert_eq!(
+        check_encoding("application/json;reading/2", "reading/2"),
+        Ok(Format::Json)
+    );
     let e = check_encoding("image/png", "reading/2").unwrap_err();
     assert_eq!(e.fault_name(), "bad_payload");
 }
@@ -95,9 +122,22 @@ fn wrong_name_or_version_is_refused_with_found_and_expected() {
 #[test]
 fn oversize_is_refused_before_decoding() {
     let e = decode::<Reading>(&[0xFF; 101], Format::Bincode, 100).unwrap_err();
-    assert_eq!(e, CodecError::TooLarge { schema: "reading/2".into(), found: 101, limit: 100 });
-    let big = Reading { pixels: vec![0; MAX_PAYLOAD_BYTES], ..reading() };
-    assert_eq!(encode(&big, Format::Bincode).unwrap_err().fault_name(), "payload_too_large");
+    assert_eq!(
+        e,
+        CodecError::TooLarge {
+            schema: "reading/2".into(),
+            found: 101,
+            limit: 100
+        }
+    );
+    let big = Reading {
+        pixels: vec![0; MAX_PAYLOAD_BYTES],
+        ..reading()
+    };
+    assert_eq!(
+        encode(&big, Format::Bincode).unwrap_err().fault_name(),
+        "payload_too_large"
+    );
 }
 
 #[test]
@@ -106,7 +146,10 @@ fn a_claimed_length_cannot_allocate_more_than_the_limit() {
     let mut bytes = vec![0; 24];
     bytes.extend([253, 0, 0, 0, 0, 0, 0, 0, 0x10]);
     let e = decode::<Reading>(&bytes, Format::Bincode, 1000).unwrap_err();
-    assert!(matches!(e, CodecError::Malformed { bytes: 33, .. }), "{e:?}");
+    assert!(
+        matches!(e, CodecError::Malformed { bytes: 33, .. }),
+        "{e:?}"
+    );
 }
 
 #[test]
@@ -117,7 +160,11 @@ fn bytes_after_the_message_are_refused() {
     let e = decode::<Reading>(&bytes, Format::Bincode, 1000).unwrap_err();
     assert_eq!(
         e,
-        CodecError::TrailingBytes { schema: "reading/2".into(), used, bytes: used + 1 }
+        CodecError::TrailingBytes {
+            schema: "reading/2".into(),
+            used,
+            bytes: used + 1
+        }
     );
     let mut text = encode(&reading(), Format::Json).unwrap();
     text.extend(b" {}");
@@ -138,13 +185,17 @@ fn numbers_must_be_finite_in_both_formats_and_directions() {
     let raw = bincode::serde::encode_to_vec(&message, bincode::config::standard()).unwrap();
     let e = decode::<Reading>(&raw, Format::Bincode, 1000).unwrap_err();
     assert!(e.to_string().contains("position_m[2]: NaN"), "{e}");
-    message = Reading { note: Some(f64::INFINITY), ..reading() };
+    message = Reading {
+        note: Some(f64::INFINITY),
+        ..reading()
+    };
     let e = encode(&message, Format::Json).unwrap_err();
     assert!(e.to_string().contains("note: inf"), "{e}");
-    for text in [r#"{"name":"a","service":"b","message":"c","details":{"x_m":NaN}}"#,
+    for text in [
+        r#"{"name":"a","service":"b","message":"c","details":{"x_m":NaN}}"#,
         r#"{"name":"a","service":"b","message":"c","details":{"x_m":1e999}}"#,
-        r#"{"name":"a","service":"b","message":"c","details":{"x_m":null}}"#]
-    {
+        r#"{"name":"a","service":"b","message":"c","details":{"x_m":null}}"#,
+    ] {
         let e = decode::<Fault>(text.as_bytes(), Format::Json, 1000).unwrap_err();
         assert_eq!(e.fault_name(), "bad_payload");
     }
