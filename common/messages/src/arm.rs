@@ -52,6 +52,24 @@ pub enum StopReason {
     },
 }
 
+impl std::fmt::Display for StopReason {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Contact => f.write_str("the contact switch closed"),
+            Self::Force { found_n, limit_n } => {
+                write!(f, "tip force {found_n:.1} N, limit {limit_n} N")
+            }
+            Self::Deviation { joint_n, found_rad, limit_rad } => write!(
+                f,
+                "joint {joint_n} is {found_rad:.4} rad off its trajectory, limit {limit_rad} rad"
+            ),
+            Self::Cancelled => f.write_str("the commander cancelled the goal"),
+            Self::StopCommand => f.write_str("arm/stop was asked"),
+            Self::CommanderLost { commander } => write!(f, "the commander `{commander}` is lost"),
+        }
+    }
+}
+
 /// The arm as its encoders and switch report it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -7,6 +7,8 @@
 //! shell.start(vec![served]).await // presence comes last: whoever sees it can ask every key
 //! ```
 
+pub mod motion;
+
 use rover_bus::{BusError, Peer, Presence, Served, Stream};
 use rover_messages::{
     Fault, keys,
