@@ -1,0 +1,9 @@
+//! The camera models against references that share no code with them.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+mod common;
+mod formats;
+mod models;
+mod reference;
+mod round_trip;
+mod stereo;
