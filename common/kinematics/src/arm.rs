@@ -1,0 +1,438 @@
+//! The arm: Denavit-Hartenberg rows, joint limits, forward kinematics.
+
+use crate::inverse::family::{Family, FamilyMismatch};
+use crate::trig::sin_cos;
+use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
+
+/// Fewest joints of an [`Arm`].
+pub const MIN_JOINTS: usize = 4;
+/// Most joints of an [`Arm`].
+pub const MAX_JOINTS: usize = 7;
+/// Rounding that a joint angle may exceed its limit by and still count as within it, radians.
+pub const LIMIT_TOLERANCE_RAD: f64 = 1e-9;
+/// `MAX_JOINTS` rounded up to the lanes of the sine kernel.
+pub(crate) const PADDED: usize = 8;
+
+/// One row of the classic Denavit-Hartenberg table:
+/// `Rz(theta + theta_offset_rad) Tz(d_m) Tx(a_m) Rx(alpha_rad)`.
+#[derive(Serialize, Deserialize, Clone, Debug, PartialEq)]
+#[serde(deny_unknown_fields)]
+pub struct DhRow {
+    /// Length along the new x axis, metres.
+    pub a_m: f64,
+    /// Twist about the new x axis, radians.
+    pub alpha_rad: f64,
+    /// Offset along the old z axis, metres.
+    pub d_m: f64,
+    /// Added to the joint angle, radians.
+    pub theta_offset_rad: f64,
+}
+
+/// What one joint may do.
+#[derive(Serialize, Deserialize, Clone, Debug, PartialEq)]
+#[serde(deny_unknown_fields)]
+pub struct JointLimits {
+    /// Smallest joint angle, radians.
+    pub lower_rad: f64,
+    /// Largest joint angle, radians.
+    pub upper_rad: f64,
+    /// Largest magnitude of the joint rate, rad/s, positive.
+    pub max_rate_rad_s: f64,
+    /// Largest magnitude of the joint acceleration, rad/s^2, positive.
+    pub max_acceleration_rad_s2: f64,
+}
+
+/// Why an arm cannot be built or asked. Joint indices count from 0.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ArmError {
+    /// Too few or too many rows.
+    #[error("an arm has {MIN_JOINTS} to {MAX_JOINTS} joints, got {found} Denavit-Hartenberg rows")]
+    JointCount {
+        /// Rows given.
+        found: usize,
+    },
+    /// A list has the wrong length for this arm.
+    #[error("{what}: expected {expected} values, got {found}")]
+    WrongLength {
+        /// Which list.
+        what: &'static str,
+        /// Length that fits the arm.
+        expected: usize,
+        /// Length given.
+        found: usize,
+    },
+    /// A number is NaN or infinite.
+    #[error("{what}[{index}] = {value} is not a finite number")]
+    NotFinite {
+        /// Which list or vector.
+        what: &'static str,
+        /// Place in it, from 0.
+        index: usize,
+        /// The offending value.
+        value: f64,
+    },
+    /// A joint's limits contradict themselves.
+    #[error("joint[{joint}]: {what} = {value}, expected {expected}")]
+    BadLimit {
+        /// Joint, from 0.
+        joint: usize,
+        /// Field of [`JointLimits`].
+        what: &'static str,
+        /// Value given.
+        value: f64,
+        /// What would be right.
+        expected: &'static str,
+    },
+    /// A joint angle is outside its limits.
+    #[error("joint[{joint}] = {value_rad:.6} rad is outside {lower_rad:.6} to {upper_rad:.6} rad")]
+    OutsideLimit {
+        /// Joint, from 0.
+        joint: usize,
+        /// Joint angle, radians.
+        value_rad: f64,
+        /// Lower limit, radians.
+        lower_rad: f64,
+        /// Upper limit, radians.
+        upper_rad: f64,
+    },
+}
+
+/// Constants of one row, prepared for the kernels.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Link {
+    pub a: f64,
+    pub d: f64,
+    pub offset: f64,
+    pub sin_alpha: f64,
+    pub cos_alpha: f64,
+    sin_half_alpha: f64,
+    cos_half_alpha: f64,
+}
+
+/// A serial arm of 4 to 7 revolute joints.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Arm {
+    rows: Vec<DhRow>,
+    limits: Vec<JointLimits>,
+    pub(crate) links: [Link; MAX_JOINTS],
+    pub(crate) family: Result<Family, FamilyMismatch>,
+}
+
+/// Axes and origins of all frames, `0..=n`, in the base frame.
+pub(crate) struct Frames {
+    pub count: usize,
+    pub x: [Vector3<f64>; PADDED],
+    pub z: [Vector3<f64>; PADDED],
+    pub origin: [Vector3<f64>; PADDED],
+}
+
+impl Frames {
+    /// The y axis of frame `i`.
+    #[inline]
+    pub fn y(&self, i: usize) -> Vector3<f64> {
+        self.z[i].cross(&self.x[i])
+    }
+
+    /// A vector of the last link in the base frame.
+    #[inline]
+    pub fn rotate(&self, in_link: &Vector3<f64>) -> Vector3<f64> {
+        let n = self.count;
+        self.x[n] * in_link.x + self.y(n) * in_link.y + self.z[n] * in_link.z
+    }
+}
+
+/// Refuses a vector with a component that is not finite.
+pub(crate) fn finite(what: &'static str, values: &[f64]) -> Result<(), ArmError> {
+    match values.iter().position(|v| !v.is_finite()) {
+        None => Ok(()),
+        Some(index) => Err(ArmError::NotFinite {
+            what,
+            index,
+            value: values[index],
+        }),
+    }
+}
+
+impl Arm {
+    /// An arm from its rows and the limits of its joints, both from the base outwards.
+    ///
+    /// # Errors
+    /// [`ArmError`] when there are not 4 to 7 rows, the lists differ in length, a number is not
+    /// finite, a lower limit is not below its upper one, or a rate or acceleration is not
+    /// positive.
+    pub fn new(rows: Vec<DhRow>, limits: Vec<JointLimits>) -> Result<Self, ArmError> {
+        let n = rows.len();
+        if !(MIN_JOINTS..=MAX_JOINTS).contains(&n) {
+            return Err(ArmError::JointCount { found: n });
+        }
+        if limits.len() != n {
+            let found = limits.len();
+            return Err(ArmError::WrongLength {
+                what: "joint limits",
+                expected: n,
+                found,
+            });
+        }
+        let column = |what, pick: fn(&DhRow) -> f64| {
+            finite(what, &rows.iter().map(pick).collect::<Vec<_>>())
+        };
+        column("a_m", |r| r.a_m)?;
+        column("alpha_rad", |r| r.alpha_rad)?;
+        column("d_m", |r| r.d_m)?;
+        column("theta_offset_rad", |r| r.theta_offset_rad)?;
+        for (joint, l) in limits.iter().enumerate() {
+            let bad = |what, value, expected| ArmError::BadLimit {
+                joint,
+                what,
+                value,
+                expected,
+            };
+            if !l.lower_rad.is_finite() {
+                return Err(bad("lower_rad", l.lower_rad, "a finite angle"));
+            }
+            if !(l.upper_rad.is_finite() && l.upper_rad > l.lower_rad) {
+                return Err(bad(
+                    "upper_rad",
+                    l.upper_rad,
+                    "a finite angle above lower_rad",
+                ));
+            }
+            if !(l.max_rate_rad_s.is_finite() && l.max_rate_rad_s > 0.0) {
+                return Err(bad("max_rate_rad_s", l.max_rate_rad_s, "a positive rate"));
+            }
+            let acceleration = l.max_acceleration_rad_s2;
+            if !(acceleration.is_finite() && acceleration > 0.0) {
+                let expected = "a positive acceleration";
+                return Err(bad("max_acceleration_rad_s2", acceleration, expected));
+            }
+        }
+        let links = std::array::from_fn(|i| {
+            let zero = DhRow {
+                a_m: 0.0,
+                alpha_rad: 0.0,
+                d_m: 0.0,
+                theta_offset_rad: 0.0,
+            };
+            let row = rows.get(i).unwrap_or(&zero);
+            let (s, c) = sin_cos(&[row.alpha_rad, 0.5 * row.alpha_rad], 2);
+            Link {
+                a: row.a_m,
+                d: row.d_m,
+                offset: row.theta_offset_rad,
+                sin_alpha: s[0],
+                cos_alpha: c[0],
+                sin_half_alpha: s[1],
+                cos_half_alpha: c[1],
+            }
+        });
+        let family = Family::of(&rows);
+        Ok(Self {
+            rows,
+            limits,
+            links,
+            family,
+        })
+    }
+
+    /// How many joints there are, 4 to 7.
+    pub fn joint_count(&self) -> usize {
+        self.rows.len()
+    }
+
+    /// The Denavit-Hartenberg rows, from the base outwards.
+    pub fn rows(&self) -> &[DhRow] {
+        &self.rows
+    }
+
+    /// The joint limits, from the base outwards.
+    pub fn limits(&self) -> &[JointLimits] {
+        &self.limits
+    }
+
+    /// The angles about the z axes, `q + offset`, padded; refuses what is not `n` finite numbers.
+    #[inline]
+    pub(crate) fn angles(&self, q: &[f64]) -> Result<[f64; PADDED], ArmError> {
+        let n = self.rows.len();
+        if q.len() != n {
+            let found = q.len();
+            return Err(ArmError::WrongLength {
+                what: "joint angles",
+                expected: n,
+                found,
+            });
+        }
+        let mut angles = [0.0; PADDED];
+        let mut magnitude = 0.0;
+        for ((angle, q), link) in angles.iter_mut().zip(q).zip(&self.links) {
+            *angle = q + link.offset;
+            magnitude += angle.abs();
+        }
+        if !f64::is_finite(magnitude) {
+            finite("joint angles", q)?;
+        }
+        Ok(angles)
+    }
+
+    /// The pose of the last link, `base_from_link`, at joint angles `q` (radians, one per joint).
+    ///
+    /// Built from the tip backwards: the translation passes through two plane rotations per
+    /// joint, and the rotation is a product of quaternions, so nothing is normalised or
+    /// converted at the end.
+    ///
+    /// # Errors
+    /// [`ArmError`] when `q` has the wrong length or a value that is not finite.
+    #[inline]
+    pub fn forward(&self, q: &[f64]) -> Result<Isometry3<f64>, ArmError> {
+        let n = self.rows.len();
+        let mut half = self.angles(q)?;
+        for angle in &mut half {
+            *angle *= 0.5;
+        }
+        let (sine, cosine) = sin_cos(&half, n);
+        let (mut w, mut i, mut j, mut k) = (1.0, 0.0, 0.0, 0.0);
+        let (mut x, mut y, mut z) = (0.0, 0.0, 0.0);
+        for joint in (0..n).rev() {
+            let link = &self.links[joint];
+            let (s, c) = (sine[joint], cosine[joint]);
+            let (sin, cos) = (2.0 * s * c, 1.0 - 2.0 * s * s);
+            let (x1, y1) = (x + link.a, link.cos_alpha * y - link.sin_alpha * z);
+            z = link.sin_alpha * y + link.cos_alpha * z + link.d;
+            x = cos * x1 - sin * y1;
+            y = sin * x1 + cos * y1;
+            let (lw, li) = (c * link.cos_half_alpha, c * link.sin_half_alpha);
+            let (lj, lk) = (s * link.sin_half_alpha, s * link.cos_half_alpha);
+            (w, i, j, k) = (
+                (lw * w - li * i) - (lj * j + lk * k),
+                (lw * i + li * w) + (lj * k - lk * j),
+                (lw * j + lj * w) + (lk * i - li * k),
+                (lw * k + lk * w) + (li * j - lj * i),
+            );
+        }
+        Ok(Isometry3::from_parts(
+            Translation3::new(x, y, z),
+            UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k)),
+        ))
+    }
+
+    /// Axes and origins of all frames.
+    #[inline]
+    pub(crate) fn frames(&self, q: &[f64]) -> Result<Frames, ArmError> {
+        let n = self.rows.len();
+        let (sine, cosine) = sin_cos(&self.angles(q)?, n);
+        let mut frames = Frames {
+            count: n,
+            x: [Vector3::x(); PADDED],
+            z: [Vector3::z(); PADDED],
+            origin: [Vector3::zeros(); PADDED],
+        };
+        let (mut x, mut y, mut z) = (Vector3::x(), Vector3::y(), Vector3::z());
+        let mut origin = Vector3::zeros();
+        for joint in 0..n {
+            let link = &self.links[joint];
+            let (s, c) = (sine[joint], cosine[joint]);
+            let turned = y * c - x * s;
+            x = x * c + y * s;
+            origin += z * link.d + x * link.a;
+            y = turned * link.cos_alpha + z * link.sin_alpha;
+            z = z * link.cos_alpha - turned * link.sin_alpha;
+            frames.x[joint + 1] = x;
+            frames.z[joint + 1] = z;
+            frames.origin[joint + 1] = origin;
+        }
+        Ok(frames)
+    }
+
+    /// The poses of all links, `base_from_link_i` for `i = 0..=n`; the first is the identity.
+    ///
+    /// # Errors
+    /// As [`Arm::forward`].
+    pub fn link_poses(&self, q: &[f64]) -> Result<Vec<Isometry3<f64>>, ArmError> {
+        let n = self.rows.len();
+        let mut half = self.angles(q)?;
+        for angle in &mut half {
+            *angle *= 0.5;
+        }
+        let (sine, cosine) = sin_cos(&half, n);
+        let mut poses = Vec::with_capacity(n + 1);
+        let mut pose = Isometry3::identity();
+        poses.push(pose);
+        for joint in 0..n {
+            let link = &self.links[joint];
+            let (s, c) = (sine[joint], cosine[joint]);
+            let (sin, cos) = (2.0 * s * c, 1.0 - 2.0 * s * s);
+            pose *= Isometry3::from_parts(
+                Translation3::new(link.a * cos, link.a * sin, link.d),
+                UnitQuaternion::new_unchecked(Quaternion::new(
+                    c * link.cos_half_alpha,
+                    c * link.sin_half_alpha,
+                    s * link.sin_half_alpha,
+                    s * link.cos_half_alpha,
+                )),
+            );
+            poses.push(pose);
+        }
+        Ok(poses)
+    }
+
+    /// A point fixed to the last link (`point_in_link`, metres) in the base frame, metres.
+    ///
+    /// # Errors
+    /// As [`Arm::forward`].
+    pub fn point(&self, q: &[f64], point_in_link: &Vector3<f64>) -> Result<Vector3<f64>, ArmError> {
+        let base_from_link = self.forward(q)?;
+        Ok(base_from_link.rotation * point_in_link + base_from_link.translation.vector)
+    }
+
+    /// Whether every joint angle (radians) is within its limits, [`LIMIT_TOLERANCE_RAD`] allowed.
+    ///
+    /// # Errors
+    /// [`ArmError::OutsideLimit`] for the first joint that is not, or as [`Arm::forward`].
+    pub fn check_limits(&self, q: &[f64]) -> Result<(), ArmError> {
+        self.angles(q)?;
+        for (joint, (&value_rad, l)) in q.iter().zip(&self.limits).enumerate() {
+            let (lower_rad, upper_rad) = (l.lower_rad, l.upper_rad);
+            if value_rad < lower_rad - LIMIT_TOLERANCE_RAD
+                || value_rad > upper_rad + LIMIT_TOLERANCE_RAD
+            {
+                return Err(ArmError::OutsideLimit {
+                    joint,
+                    value_rad,
+                    lower_rad,
+                    upper_rad,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// The arm with model errors `e` added to its rows: four per joint in the order
+    /// `[theta, d, a, alpha]` (radians, metres, metres, radians), from the base outwards.
+    ///
+    /// # Errors
+    /// [`ArmError`] when `e` does not have `4 n` finite values.
+    pub fn perturbed(&self, e: &[f64]) -> Result<Self, ArmError> {
+        let expected = 4 * self.rows.len();
+        if e.len() != expected {
+            let found = e.len();
+            return Err(ArmError::WrongLength {
+                what: "model errors",
+                expected,
+                found,
+            });
+        }
+        finite("model errors", e)?;
+        let rows = self
+            .rows
+            .iter()
+            .zip(e.chunks_exact(4))
+            .map(|(row, e)| DhRow {
+                theta_offset_rad: row.theta_offset_rad + e[0],
+                d_m: row.d_m + e[1],
+                a_m: row.a_m + e[2],
+                alpha_rad: row.alpha_rad + e[3],
+            })
+            .collect();
+        Self::new(rows, self.limits.clone())
+    }
+}
