@@ -25,7 +25,6 @@ pub struct Camera {
 /// Written as `{ "cahv": { "c": [..], .. } }`; the upper-case names are read too.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-#[non_exhaustive]
 pub enum CameraModel {
     /// Perspective without distortion.
     #[serde(rename = "cahv", alias = "Cahv", alias = "CAHV")]
