@@ -70,8 +70,10 @@ impl Robot {
     /// [`RobotError`] with file, field, what was found and what was expected.
     pub fn read(path: &Path) -> Result<Self, RobotError> {
         let origin = path.display().to_string();
-        let text = std::fs::read_to_string(path)
-            .map_err(|source| RobotError::File { path: origin.clone(), source })?;
+        let text = std::fs::read_to_string(path).map_err(|source| RobotError::File {
+            path: origin.clone(),
+            source,
+        })?;
         Self::parse(&text, &origin)
     }
 
@@ -122,8 +124,10 @@ impl Robot {
         let link_from_plate = check.plate(&description)?;
         let text = toml::to_string(&description)
             .map_err(|e| check.error("robot", format!("cannot be written as TOML: {e}")))?;
-        let configuration_sha256 =
-            Sha256::digest(text.as_bytes()).iter().map(|b| format!("{b:02x}")).collect();
+        let configuration_sha256 = Sha256::digest(text.as_bytes())
+            .iter()
+            .map(|b| format!("{b:02x}"))
+            .collect();
         Ok(Self {
             arm,
             tool,
@@ -154,13 +158,15 @@ impl Robot {
     /// # Errors
     /// [`RobotError::Unknown`] with the names there are.
     pub fn pair(&self, name: &str) -> Result<&CameraPairDescription, RobotError> {
-        self.description.cameras.iter().find(|p| p.name == name).ok_or_else(|| {
-            RobotError::Unknown {
+        self.description
+            .cameras
+            .iter()
+            .find(|p| p.name == name)
+            .ok_or_else(|| RobotError::Unknown {
                 kind: "camera pair",
                 name: name.into(),
                 known: list(self.description.cameras.iter().map(|p| p.name.as_str())),
-            }
-        })
+            })
     }
 
     /// The joint angles of a named posture, rad.
@@ -168,13 +174,15 @@ impl Robot {
     /// # Errors
     /// [`RobotError::Unknown`] with the names there are.
     pub fn posture(&self, name: &str) -> Result<&[f64], RobotError> {
-        self.description.postures.get(name).map(Vec::as_slice).ok_or_else(|| {
-            RobotError::Unknown {
+        self.description
+            .postures
+            .get(name)
+            .map(Vec::as_slice)
+            .ok_or_else(|| RobotError::Unknown {
                 kind: "posture",
                 name: name.into(),
                 known: list(self.description.postures.keys().map(String::as_str)),
-            }
-        })
+            })
     }
 
     /// Pose of the last link for joint angles `q` (rad).
@@ -193,14 +201,17 @@ impl Robot {
     /// first pair's camera centres, rover frame, m.
     pub fn mount_centre(&self) -> Vector3<f64> {
         let pair = &self.description.cameras[0].cameras;
-        (pair.left.centre() + pair.right.centre()) / 2.0
+        (pair.left.model.cahv()[0] + pair.right.model.cahv()[0]) / 2.0
     }
 }
 
 /// The isometry of a described pose.
 pub(crate) fn pose(p: &PoseDescription) -> Isometry3<f64> {
     let [r, pt, y] = p.rpy_deg.map(f64::to_radians);
-    Isometry3::from_parts(Vector3::from(p.xyz_m).into(), UnitQuaternion::from_euler_angles(r, pt, y))
+    Isometry3::from_parts(
+        Vector3::from(p.xyz_m).into(),
+        UnitQuaternion::from_euler_angles(r, pt, y),
+    )
 }
 
 fn list<'a>(names: impl Iterator<Item = &'a str>) -> String {
@@ -221,7 +232,11 @@ impl Check<'_> {
     }
 
     fn require(&self, ok: bool, field: &str, message: impl Into<String>) -> Result<(), RobotError> {
-        if ok { Ok(()) } else { Err(self.error(field, message)) }
+        if ok {
+            Ok(())
+        } else {
+            Err(self.error(field, message))
+        }
     }
 
     fn positive(&self, field: &str, value: f64) -> Result<(), RobotError> {
@@ -235,7 +250,12 @@ impl Check<'_> {
     fn direction(&self, field: &str, v: [f64; 3]) -> Result<Unit<Vector3<f64>>, RobotError> {
         Unit::try_new(Vector3::from(v), 1e-9)
             .filter(|u| u.iter().all(|x| x.is_finite()))
-            .ok_or_else(|| self.error(field, format!("{v:?}, expected a direction other than zero")))
+            .ok_or_else(|| {
+                self.error(
+                    field,
+                    format!("{v:?}, expected a direction other than zero"),
+                )
+            })
     }
 
     fn capsules(&self, field: &str, capsules: &[Capsule]) -> Result<(), RobotError> {
@@ -253,7 +273,9 @@ impl Check<'_> {
 
     fn all(&self, d: &RobotDescription) -> Result<(), RobotError> {
         let named = !d.name.is_empty()
-            && d.name.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_');
+            && d.name
+                .chars()
+                .all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_');
         self.require(
             named,
             "name",
@@ -283,16 +305,26 @@ impl Check<'_> {
         self.require(
             s.travel_m > s.closes_at_m,
             "tool.switch.travel_m",
-            format!("{}, expected more than closes_at_m = {}", s.travel_m, s.closes_at_m),
+            format!(
+                "{}, expected more than closes_at_m = {}",
+                s.travel_m, s.closes_at_m
+            ),
         )?;
-        self.require(!d.cameras.is_empty(), "cameras", "none, expected at least one pair")?;
+        self.require(
+            !d.cameras.is_empty(),
+            "cameras",
+            "none, expected at least one pair",
+        )?;
         for pair in &d.cameras {
             for (side, camera) in [("left", &pair.cameras.left), ("right", &pair.cameras.right)] {
                 camera.validate().map_err(|e| {
                     self.error(&format!("cameras.{}.{side}", pair.name), e.to_string())
                 })?;
             }
-            self.positive(&format!("cameras.{}.range_min_m", pair.name), pair.range_min_m)?;
+            self.positive(
+                &format!("cameras.{}.range_min_m", pair.name),
+                pair.range_min_m,
+            )?;
             self.require(
                 pair.range_max_m > pair.range_min_m,
                 &format!("cameras.{}.range_max_m", pair.name),
@@ -326,11 +358,17 @@ impl Check<'_> {
     }
 
     fn dynamics(&self, d: &RobotDescription) -> Result<(), RobotError> {
-        let Some(dynamics) = &d.dynamics else { return Ok(()) };
+        let Some(dynamics) = &d.dynamics else {
+            return Ok(());
+        };
         self.require(
             dynamics.links.len() == d.arm.joints.len(),
             "dynamics.links",
-            format!("{}, expected one per joint ({})", dynamics.links.len(), d.arm.joints.len()),
+            format!(
+                "{}, expected one per joint ({})",
+                dynamics.links.len(),
+                d.arm.joints.len()
+            ),
         )?;
         for (i, link) in dynamics.links.iter().enumerate() {
             for (field, value) in [
@@ -338,7 +376,10 @@ impl Check<'_> {
                 ("stiffness_nm_rad", link.stiffness_nm_rad),
                 ("damping_nms_rad", link.damping_nms_rad),
                 ("max_torque_nm", link.max_torque_nm),
-                ("inertia_kg_m2", link.inertia_kg_m2.iter().copied().fold(f64::MAX, f64::min)),
+                (
+                    "inertia_kg_m2",
+                    link.inertia_kg_m2.iter().copied().fold(f64::MAX, f64::min),
+                ),
             ] {
                 self.positive(&format!("dynamics.links[{i}].{field}"), value)?;
             }
@@ -348,14 +389,20 @@ impl Check<'_> {
 
     fn plate(&self, d: &RobotDescription) -> Result<Isometry3<f64>, RobotError> {
         let f = &d.fiducial;
-        f.layout.validate().map_err(|e| self.error("fiducial.layout", e.to_string()))?;
+        f.layout
+            .validate()
+            .map_err(|e| self.error("fiducial.layout", e.to_string()))?;
         let z = self.direction("fiducial.normal", f.normal)?.into_inner();
         let right = Vector3::from(f.right);
         let x = self
             .direction("fiducial.right", (right - z * z.dot(&right)).into())?
             .into_inner();
         let axes = Matrix3::from_columns(&[x, z.cross(&x), z]);
-        let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
-        Ok(Isometry3::from_parts(Vector3::from(f.centre_m).into(), rotation))
+        let rotation =
+            UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
+        Ok(Isometry3::from_parts(
+            Vector3::from(f.centre_m).into(),
+            rotation,
+        ))
     }
 }

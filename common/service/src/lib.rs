@@ -8,6 +8,9 @@
 //! ```
 
 pub mod motion;
+mod reach;
+
+pub use reach::{joints_refusal, reach_refusal};
 
 use rover_bus::{BusError, Peer, Presence, Served, Stream};
 use rover_messages::{
@@ -72,7 +75,9 @@ impl ServiceShell {
             faults: peer.stream(&keys::fault(name)).await?,
             status: Mutex::new(status),
         };
-        let shell = Self { inner: Arc::new(inner) };
+        let shell = Self {
+            inner: Arc::new(inner),
+        };
         shell.change(|_| ());
         Ok(shell)
     }
@@ -85,7 +90,11 @@ impl ServiceShell {
     /// declared.
     pub async fn start(self, served: Vec<Served>) -> Result<Service, BusError> {
         let presence = self.inner.peer.announce().await?;
-        Ok(Service { shell: self, _presence: presence, _served: served })
+        Ok(Service {
+            shell: self,
+            _presence: presence,
+            _served: served,
+        })
     }
 
     /// The service's name.
@@ -106,7 +115,9 @@ impl ServiceShell {
     /// Says what the service is doing until the returned value is dropped.
     pub fn activity(&self, state: &str) -> Activity {
         self.state(state);
-        Activity { shell: self.clone() }
+        Activity {
+            shell: self.clone(),
+        }
     }
 
     /// Adds one to a counter.
@@ -122,7 +133,10 @@ impl ServiceShell {
             s.last_fault = Some(fault.clone());
             *s.counters.entry("faults".into()).or_default() += 1;
         });
-        let report = FaultReport { fault: fault.clone(), action: action.into() };
+        let report = FaultReport {
+            fault: fault.clone(),
+            action: action.into(),
+        };
         if let Err(error) = self.inner.faults.publish(report) {
             tracing::warn!(%error, "a fault could not be published");
         }
@@ -142,7 +156,10 @@ impl ServiceShell {
 
     fn lock(&self) -> MutexGuard<'_, ServiceStatus> {
         // Every change is a single assignment, so a poisoned status is still whole.
-        self.inner.status.lock().unwrap_or_else(PoisonError::into_inner)
+        self.inner
+            .status
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 
     fn change(&self, change: impl FnOnce(&mut ServiceStatus)) {
@@ -170,12 +187,16 @@ impl Drop for Activity {
 
 impl fmt::Debug for ServiceShell {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("ServiceShell").field("status", &self.status()).finish_non_exhaustive()
+        f.debug_struct("ServiceShell")
+            .field("status", &self.status())
+            .finish_non_exhaustive()
     }
 }
 
 impl fmt::Debug for Service {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Service").field("status", &self.shell.status()).finish_non_exhaustive()
+        f.debug_struct("Service")
+            .field("status", &self.shell.status())
+            .finish_non_exhaustive()
     }
 }

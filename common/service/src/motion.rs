@@ -22,7 +22,10 @@ pub struct ArmClient {
 impl ArmClient {
     /// The arm, commanded by `service`.
     pub fn new(peer: &Peer, service: &'static str) -> Self {
-        Self { peer: peer.clone(), service }
+        Self {
+            peer: peer.clone(),
+            service,
+        }
     }
 
     /// The arm's present state.
@@ -63,7 +66,10 @@ impl ArmClient {
     where
         F: rover_messages::Wire + Clone,
     {
-        let goal = ExecuteGoal { trajectory: plan.trajectory.clone(), guard };
+        let goal = ExecuteGoal {
+            trajectory: plan.trajectory.clone(),
+            guard,
+        };
         let mut running = self
             .peer
             .command::<_, ExecuteFeedback, ExecuteResult>(keys::ARM_EXECUTE, &goal)
@@ -75,7 +81,10 @@ impl ArmClient {
                 && let Some(interrupt) = context.interrupted()
             {
                 interruption = Some(interrupted(self.service, &interrupt));
-                running.cancel().await.map_err(|e| self.fault("arm_silent", &e))?;
+                running
+                    .cancel()
+                    .await
+                    .map_err(|e| self.fault("arm_silent", &e))?;
             }
             let beat = running.beat().await;
             match (beat, &interruption) {
@@ -107,7 +116,9 @@ impl ArmClient {
 /// The fault that an interrupted goal ends with.
 pub fn interrupted(service: &str, interrupt: &Interrupt) -> Fault {
     match interrupt {
-        Interrupt::Cancelled => Fault::new(service, "cancelled", "the commander cancelled the goal"),
+        Interrupt::Cancelled => {
+            Fault::new(service, "cancelled", "the commander cancelled the goal")
+        }
         other => Fault::new(service, "commander_lost", format!("{other:?}")),
     }
 }

@@ -73,8 +73,14 @@ impl GuardedMove {
             .model
             .error_at(&self.goal.compensation, q)
             .map_err(|e| compensation_fault(&e))?;
-        let link = self.model.rover_from_link(q).map_err(|e| compensation_fault(&e.into()))?;
-        let tip = link.transform_point(&self.model.tool.tip_in_link.into()).coords + error;
+        let link = self
+            .model
+            .rover_from_link(q)
+            .map_err(|e| compensation_fault(&e.into()))?;
+        let tip = link
+            .transform_point(&self.model.tool.tip_in_link.into())
+            .coords
+            + error;
         let target = &self.goal.target;
         Ok(target.normal.unit.dot(&(tip - target.position_m.coords)))
     }

@@ -19,9 +19,15 @@ use std::{sync::Arc, time::Duration};
 /// [`BusError`] when a key cannot be declared or the name is taken.
 pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
     let shell = ServiceShell::new(peer, &robot, CONTACT_APPROACH).await?;
-    let contact =
-        Contact { arm: ArmClient::new(peer, CONTACT_APPROACH), robot, shell: shell.clone() };
-    let policy = ActionPolicy { lockstep: false, beat_limit: Duration::from_secs(10) };
+    let contact = Contact {
+        arm: ArmClient::new(peer, CONTACT_APPROACH),
+        robot,
+        shell: shell.clone(),
+    };
+    let policy = ActionPolicy {
+        lockstep: false,
+        beat_limit: Duration::from_secs(10),
+    };
     let action = peer
         .serve_action(keys::CONTACT_APPROACH, policy, move |context, goal| {
             let contact = contact.clone();
@@ -68,11 +74,21 @@ impl Contact {
         let before = self.arm.state().await.map_err(|f| (f, REFUSED))?;
         if before.contact {
             let message = "the contact switch is closed before the approach, expected it open";
-            return Err((Fault::new(CONTACT_APPROACH, "switch_already_closed", message), REFUSED));
+            return Err((
+                Fault::new(CONTACT_APPROACH, "switch_already_closed", message),
+                REFUSED,
+            ));
         }
-        let start_m = motion.distance_m(&before.joints_rad).map_err(|f| (f, REFUSED))?;
-        let request = motion.approach(&before.joints_rad).map_err(|f| (f, REFUSED))?;
-        let guard = Guard { max_force_n: Some(goal.max_force_n), ..Guard::default() };
+        let start_m = motion
+            .distance_m(&before.joints_rad)
+            .map_err(|f| (f, REFUSED))?;
+        let request = motion
+            .approach(&before.joints_rad)
+            .map_err(|f| (f, REFUSED))?;
+        let guard = Guard {
+            max_force_n: Some(goal.max_force_n),
+            ..Guard::default()
+        };
         let done = self
             .move_arm(context, &motion, &request, guard, "approaching")
             .await
@@ -81,13 +97,19 @@ impl Contact {
             Outcome::Contact => done.joints_at_contact_rad.clone().unwrap_or_default(),
             Outcome::NoContact(fault) => {
                 let back = self.retract(context, &motion, &done).await;
-                let action = if back.is_ok() { "arm retracted to the standoff" } else { STOPPED };
+                let action = if back.is_ok() {
+                    "arm retracted to the standoff"
+                } else {
+                    STOPPED
+                };
                 return Err((fault, action));
             }
         };
         let end_m = motion.distance_m(&contact_q).map_err(|f| (f, STOPPED))?;
         if goal.retract {
-            self.retract(context, &motion, &done).await.map_err(|f| (f, STOPPED))?;
+            self.retract(context, &motion, &done)
+                .await
+                .map_err(|f| (f, STOPPED))?;
         }
         Ok(ContactResult {
             made: true,
@@ -107,7 +129,8 @@ impl Contact {
         at: &ExecuteResult,
     ) -> Result<(), Fault> {
         let request = motion.retract(&at.state.joints_rad)?;
-        self.move_arm(context, motion, &request, Guard::default(), "retracting").await?;
+        self.move_arm(context, motion, &request, Guard::default(), "retracting")
+            .await?;
         Ok(())
     }
 
@@ -123,9 +146,18 @@ impl Contact {
         self.arm
             .execute(&plan, guard, context, |state| {
                 if let Ok(distance_m) = motion.distance_m(&state.joints_rad) {
-                    let activity = if state.contact { "in_contact" } else { activity }.into();
+                    let activity = if state.contact {
+                        "in_contact"
+                    } else {
+                        activity
+                    }
+                    .into();
                     let tip_force_n = state.tip_force_n;
-                    context.feedback(ContactFeedback { activity, distance_m, tip_force_n });
+                    context.feedback(ContactFeedback {
+                        activity,
+                        distance_m,
+                        tip_force_n,
+                    });
                 }
             })
             .await

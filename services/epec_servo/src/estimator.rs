@@ -127,7 +127,10 @@ impl Estimator {
         let joints = model.arm.joint_count();
         let mut sigma = DVector::zeros(n + 6);
         for j in 0..joints {
-            for (k, s) in [angle_rad, length_m, length_m, angle_rad].into_iter().enumerate() {
+            for (k, s) in [angle_rad, length_m, length_m, angle_rad]
+                .into_iter()
+                .enumerate()
+            {
                 sigma[4 * j + k] = s;
             }
         }
@@ -166,17 +169,33 @@ impl Estimator {
         let tip_in_link = self.model.tool.tip_in_link;
         let predicted_tip = rover_from_link.transform_point(&tip_in_link.into()).coords;
         let (rows, observed, noise) = match seen {
-            Seen::Position { point_in_link, seen_in_rover, covariance } => {
-                let predicted = rover_from_link.transform_point(&(*point_in_link).into()).coords;
+            Seen::Position {
+                point_in_link,
+                seen_in_rover,
+                covariance,
+            } => {
+                let predicted = rover_from_link
+                    .transform_point(&(*point_in_link).into())
+                    .coords;
                 let lever = predicted - predicted_tip;
                 let rows = self.rows(q, point_in_link, &lever)?.rows(0, 3).into_owned();
                 let vector = seen_in_rover - predicted;
-                (rows, DVector::from_column_slice(vector.as_slice()), dynamic(covariance))
+                (
+                    rows,
+                    DVector::from_column_slice(vector.as_slice()),
+                    dynamic(covariance),
+                )
             }
-            Seen::Pose { tip_in_rover, rotation_error, covariance } => {
+            Seen::Pose {
+                tip_in_rover,
+                rotation_error,
+                covariance,
+            } => {
                 let rows = self.rows(q, &tip_in_link, &Vector3::zeros())?;
                 let mut vector = DVector::zeros(6);
-                vector.fixed_rows_mut::<3>(0).copy_from(&(tip_in_rover - predicted_tip));
+                vector
+                    .fixed_rows_mut::<3>(0)
+                    .copy_from(&(tip_in_rover - predicted_tip));
                 vector.fixed_rows_mut::<3>(3).copy_from(rotation_error);
                 (
                     DMatrix::from_column_slice(6, rows.ncols(), rows.as_slice()),
@@ -247,7 +266,11 @@ impl Estimator {
     pub fn predict(&self, q: &[f64]) -> Result<(Vector6<f64>, Matrix6<f64>), EstimatorError> {
         let tip_in_link = self.model.tool.tip_in_link;
         let rows = self.rows(q, &tip_in_link, &Vector3::zeros())?;
-        let tip = self.model.rover_from_link(q)?.transform_point(&tip_in_link.into()).coords;
+        let tip = self
+            .model
+            .rover_from_link(q)?
+            .transform_point(&tip_in_link.into())
+            .coords;
         let covariance = &rows * self.drifted(&tip) * rows.transpose();
         let mean = &rows * &self.mean;
         Ok((
@@ -287,7 +310,8 @@ impl Estimator {
         let mut rows = Matrix6xX::zeros(n + 6);
         rows.columns_mut(0, n).copy_from(&jacobian);
         rows.fixed_view_mut::<6, 6>(0, n).fill_with_identity();
-        rows.fixed_view_mut::<3, 3>(0, n + 3).copy_from(&-lever.cross_matrix());
+        rows.fixed_view_mut::<3, 3>(0, n + 3)
+            .copy_from(&-lever.cross_matrix());
         Ok(rows)
     }
 

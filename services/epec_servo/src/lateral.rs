@@ -7,7 +7,11 @@ use std::f64::consts::TAU;
 /// Radius that an error with the given mean (m) and covariance (m^2) keeps in 95 % of cases, seen
 /// in the plane orthogonal to `normal`: the mean's length plus the 95 % radius of the normal
 /// distribution about it, which is a little more than the exact quantile.
-pub fn bound_95(mean: &Vector3<f64>, covariance: &Matrix3<f64>, normal: &Unit<Vector3<f64>>) -> f64 {
+pub fn bound_95(
+    mean: &Vector3<f64>,
+    covariance: &Matrix3<f64>,
+    normal: &Unit<Vector3<f64>>,
+) -> f64 {
     let (a, b) = tangent_basis(normal);
     let in_plane = Matrix2::new(
         a.dot(&(covariance * a)),
@@ -32,7 +36,11 @@ pub fn radius_95(variance_a: f64, variance_b: f64) -> f64 {
     let (mut low, mut high) = (1.9, 2.5);
     for _ in 0..40 {
         let middle = (low + high) / 2.0;
-        if inside(middle, ratio) < 0.95 { low = middle } else { high = middle }
+        if inside(middle, ratio) < 0.95 {
+            low = middle
+        } else {
+            high = middle
+        }
     }
     large.sqrt() * (low + high) / 2.0
 }

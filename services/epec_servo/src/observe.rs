@@ -75,7 +75,11 @@ pub fn look(
     let right = find("right", &frame.cameras.right, &frame.images.right)?;
     let mark = layout.discs.len();
     let pixel = |observation: &PlateObservation, camera: &Camera| {
-        let seen = observation.points.iter().find(|p| p.index == mark).map(|p| p.pixel_px);
+        let seen = observation
+            .points
+            .iter()
+            .find(|p| p.index == mark)
+            .map(|p| p.pixel_px);
         // A plate without a usable central mark is shown where its centre is predicted.
         seen.or_else(|| camera.project(&predicted.translation.vector).ok())
             .ok_or_else(|| "the plate's centre does not project into the image".to_owned())
@@ -103,10 +107,23 @@ pub fn look(
                     .copied()
                     .ok_or_else(|| format!("{side} image: the central mark was not measured"))
             };
-            (seen_position(robot, &frame.cameras, &of_mark(&left, "left")?, &of_mark(&right, "right")?)?, None)
+            (
+                seen_position(
+                    robot,
+                    &frame.cameras,
+                    &of_mark(&left, "left")?,
+                    &of_mark(&right, "right")?,
+                )?,
+                None,
+            )
         }
     };
-    Ok(Sighting { seen, left_px, right_px, rms_px })
+    Ok(Sighting {
+        seen,
+        left_px,
+        right_px,
+        rms_px,
+    })
 }
 
 fn image(data: &ImageData) -> Result<Image8, String> {
@@ -121,7 +138,9 @@ fn find_in(
     window: SearchWindow,
 ) -> Result<PlateObservation, String> {
     let centre = predicted_rover_from_plate.translation.vector;
-    let projection = camera.project_with_jacobian(&centre).map_err(|e| e.to_string())?;
+    let projection = camera
+        .project_with_jacobian(&centre)
+        .map_err(|e| e.to_string())?;
     let focal_px = projection.jacobian.norm() / std::f64::consts::SQRT_2 * projection.range_m;
     let rules = DetectionRules::default();
     let mut why = String::new();
@@ -135,7 +154,9 @@ fn find_in(
         };
         match find_plate(image, &search) {
             Ok(found) => return Ok(found),
-            Err(reason) => why = format!("{reason} (searched {radius:.0} px around the prediction)"),
+            Err(reason) => {
+                why = format!("{reason} (searched {radius:.0} px around the prediction)")
+            }
         }
     }
     Err(why)
@@ -150,10 +171,14 @@ fn seen_pose(
     plate_covariance: &Matrix6<f64>,
 ) -> Seen {
     let rover_from_link = rover_from_plate * robot.link_from_plate.inverse();
-    let tip = rover_from_link.transform_point(&robot.tool.tip_in_link.into()).coords;
+    let tip = rover_from_link
+        .transform_point(&robot.tool.tip_in_link.into())
+        .coords;
     let lever = tip - rover_from_plate.translation.vector;
     let mut to_tip = Matrix6::identity();
-    to_tip.fixed_view_mut::<3, 3>(0, 3).copy_from(&-lever.cross_matrix());
+    to_tip
+        .fixed_view_mut::<3, 3>(0, 3)
+        .copy_from(&-lever.cross_matrix());
     Seen::Pose {
         tip_in_rover: tip,
         rotation_error: (rover_from_link.rotation * kinematic_rover_from_link.rotation.inverse())
@@ -174,7 +199,10 @@ fn seen_position(
         .map_err(|e| format!("triangulation: {e}"))?;
     let point_in_plate: Vector3<f64> = left.point_in_plate;
     Ok(Seen::Position {
-        point_in_link: robot.link_from_plate.transform_point(&point_in_plate.into()).coords,
+        point_in_link: robot
+            .link_from_plate
+            .transform_point(&point_in_plate.into())
+            .coords,
         seen_in_rover: triangulation.point,
         covariance,
     })

@@ -75,9 +75,10 @@ fn fault(name: &str, message: impl Into<String>) -> Fault {
 
 fn compensation_fault(error: &CompensationError) -> Fault {
     match error {
-        CompensationError::Unreachable(e) => {
-            fault("corrected_pose_out_of_reach", format!("{e}; choose another target"))
-        }
+        CompensationError::Unreachable(e) => fault(
+            "corrected_pose_out_of_reach",
+            format!("{e}; choose another target"),
+        ),
         other => fault("internal", other.to_string()),
     }
 }
@@ -137,7 +138,9 @@ impl Placement {
                 self.phase = Phase::Arrived;
                 let pose = self.command(q)?;
                 let visible_to = Some(self.goal.target.pair.clone());
-                Ok(Step::Move(self.request(PlanGoal::Tool { pose, visible_to })))
+                Ok(Step::Move(
+                    self.request(PlanGoal::Tool { pose, visible_to }),
+                ))
             }
             Phase::Arrived if self.goal.method != Method::Kinematic => Ok(Step::Look),
             Phase::Arrived | Phase::Looked => self.advance(q),
@@ -176,7 +179,9 @@ impl Placement {
     }
 
     fn check_convergence(&self, correction: f64) -> Result<(), Fault> {
-        let [.., before, last] = self.corrections[..] else { return Ok(()) };
+        let [.., before, last] = self.corrections[..] else {
+            return Ok(());
+        };
         let growing = last > CONVERGENCE_RATIO * before && correction > CONVERGENCE_RATIO * last;
         if !growing {
             return Ok(());
@@ -223,7 +228,10 @@ impl Placement {
             station_m: self.station_m(),
             found: outcome.is_ok(),
             reason: outcome.as_ref().err().cloned(),
-            error_vector_m: outcome.as_ref().ok().map(|s| vector(position_error(&s.seen, &kinematic, self))),
+            error_vector_m: outcome
+                .as_ref()
+                .ok()
+                .map(|s| vector(position_error(&s.seen, &kinematic, self))),
             rotation_error_rad: outcome.as_ref().ok().and_then(|s| match s.seen {
                 Seen::Pose { rotation_error, .. } => Some(vector(rotation_error)),
                 Seen::Position { .. } => None,
@@ -291,7 +299,10 @@ impl Placement {
         let translation = Translation3::from(seen_tip - rotation * tip_in_link);
         let largest = |m: Matrix3<f64>| m.symmetric_eigenvalues().max().max(0.0).sqrt();
         let sigma_m = largest(covariance.fixed_view::<3, 3>(0, 0).into_owned());
-        Ok((Isometry3::from_parts(translation, rotation), SearchWindow { sigma_m }))
+        Ok((
+            Isometry3::from_parts(translation, rotation),
+            SearchWindow { sigma_m },
+        ))
     }
 
     fn tip(&self, q: &[f64]) -> Result<Vector3<f64>, Fault> {
@@ -300,7 +311,9 @@ impl Placement {
             .model()
             .rover_from_link(q)
             .map_err(|e| compensation_fault(&e.into()))?;
-        Ok(pose.transform_point(&self.robot.tool.tip_in_link.into()).coords)
+        Ok(pose
+            .transform_point(&self.robot.tool.tip_in_link.into())
+            .coords)
     }
 
     fn normal(&self) -> Unit<Vector3<f64>> {
@@ -310,8 +323,7 @@ impl Placement {
     /// The pose to command so that the tip is seen at the present station.
     fn command(&self, q: &[f64]) -> Result<ToolPose, Fault> {
         let normal = self.normal();
-        let reference =
-            self.goal.target.position_m.coords + normal.into_inner() * self.station_m();
+        let reference = self.goal.target.position_m.coords + normal.into_inner() * self.station_m();
         let solved = self
             .estimator
             .model()
@@ -340,7 +352,12 @@ impl Placement {
         let at_target = self
             .estimator
             .model()
-            .solve(&self.estimator.compensation(), &target.position_m.coords, &-normal, q)
+            .solve(
+                &self.estimator.compensation(),
+                &target.position_m.coords,
+                &-normal,
+                q,
+            )
             .map_err(|e| compensation_fault(&e))?;
         let covariance = Matrix3::from_fn(|i, j| target.covariance_m2[i][j]);
         self.estimator
@@ -354,9 +371,16 @@ impl Placement {
         if self.goal.method == Method::Kinematic || predicted <= limit {
             return Ok(predicted);
         }
-        let why = self.looks.last().and_then(|l| l.reason.clone()).unwrap_or_default();
-        let name =
-            if self.estimator.has_seen() { "predicted_error_too_large" } else { "fiducial_lost" };
+        let why = self
+            .looks
+            .last()
+            .and_then(|l| l.reason.clone())
+            .unwrap_or_default();
+        let name = if self.estimator.has_seen() {
+            "predicted_error_too_large"
+        } else {
+            "fiducial_lost"
+        };
         Err(fault(
             name,
             format!(
@@ -380,8 +404,10 @@ fn position_error(seen: &Seen, kinematic: &Isometry3<f64>, placement: &Placement
             let tip = placement.robot.tool.tip_in_link;
             tip_in_rover - kinematic.transform_point(&tip.into()).coords
         }
-        Seen::Position { point_in_link, seen_in_rover, .. } => {
-            seen_in_rover - kinematic.transform_point(&(*point_in_link).into()).coords
-        }
+        Seen::Position {
+            point_in_link,
+            seen_in_rover,
+            ..
+        } => seen_in_rover - kinematic.transform_point(&(*point_in_link).into()).coords,
     }
 }

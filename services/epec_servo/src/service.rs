@@ -34,7 +34,10 @@ pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> 
         robot,
         shell: shell.clone(),
     };
-    let policy = ActionPolicy { lockstep: false, beat_limit: Duration::from_secs(10) };
+    let policy = ActionPolicy {
+        lockstep: false,
+        beat_limit: Duration::from_secs(10),
+    };
     let action = peer
         .serve_action(keys::SERVO_PLACE, policy, move |context, goal| {
             let servo = servo.clone();
@@ -99,7 +102,11 @@ impl Servo {
                             if let Ok(distance_m) = placement.distance_m(&state.joints_rad) {
                                 let activity = "moving".into();
                                 let look = last_look.clone();
-                                context.feedback(PlaceFeedback { activity, distance_m, look });
+                                context.feedback(PlaceFeedback {
+                                    activity,
+                                    distance_m,
+                                    look,
+                                });
                             }
                         })
                         .await?;
@@ -111,18 +118,30 @@ impl Servo {
                 Step::Look => {
                     let frame: StereoFrame = self
                         .peer
-                        .ask(&keys::imaging_capture(pair), &CaptureRequest::default(), FRAME_LIMIT)
+                        .ask(
+                            &keys::imaging_capture(pair),
+                            &CaptureRequest::default(),
+                            FRAME_LIMIT,
+                        )
                         .await
                         .map_err(|e| match e {
                             BusError::Fault(fault) => fault,
                             other => Fault::new(EPEC_SERVO, "imaging_silent", other.to_string()),
                         })?;
                     let look = tokio::task::block_in_place(|| placement.look(&q, &frame))?;
-                    self.shell.count(if look.found { "fiducials_found" } else { "fiducials_missed" });
+                    self.shell.count(if look.found {
+                        "fiducials_found"
+                    } else {
+                        "fiducials_missed"
+                    });
                     let distance_m = placement.distance_m(&q)?;
                     last_look = Some(look);
                     let (activity, look) = ("looking".into(), last_look.clone());
-                    context.feedback(PlaceFeedback { activity, distance_m, look });
+                    context.feedback(PlaceFeedback {
+                        activity,
+                        distance_m,
+                        look,
+                    });
                 }
             }
         }
@@ -141,7 +160,9 @@ impl Servo {
         let retreat = async {
             let q = self.arm.state().await?.joints_rad;
             let plan = self.arm.plan(&placement.retreat(&q)?).await?;
-            self.arm.execute(&plan, Guard::default(), context, |_| ()).await
+            self.arm
+                .execute(&plan, Guard::default(), context, |_| ())
+                .await
         };
         match retreat.await {
             Ok(_) => "arm taken back to the first station",
@@ -154,7 +175,11 @@ impl Servo {
 }
 
 fn unexpected_stop(result: &rover_messages::arm::ExecuteResult) -> Fault {
-    let why = result.state.stop_reason.as_ref().map_or("no reason given".into(), ToString::to_string);
+    let why = result
+        .state
+        .stop_reason
+        .as_ref()
+        .map_or("no reason given".into(), ToString::to_string);
     Fault::new(
         EPEC_SERVO,
         "unexpected_stop",
