@@ -24,6 +24,10 @@ pub const SIM_TRUTH_SCORE: &str = "sim/truth/score";
 pub const SIM_TRUTH_STATE: &str = "sim/truth/state";
 /// A view of the scene from an outside camera; simulator only, query.
 pub const SIM_TRUTH_VIEW: &str = "sim/truth/view";
+/// Lets time pass while no motion is under way; simulator only, query.
+pub const SIM_STEP: &str = "sim/step";
+/// Starts all over; simulator only, query.
+pub const SIM_RESET: &str = "sim/reset";
 /// Injects a fault; simulator only, query.
 pub const SIM_FAULT_INJECT: &str = "sim/fault/inject";
 
@@ -67,6 +71,11 @@ pub mod service {
     /// Guarded contact motion.
     pub const CONTACT_APPROACH: &str = "contact_approach";
     /// All services that a placement needs, in starting order; the hardware is not among them.
-    pub const ALL: [&str; 5] =
-        [MAST_IMAGING, TARGET_SELECTION, ARM_PLANNER, EPEC_SERVO, CONTACT_APPROACH];
+    pub const ALL: [&str; 5] = [
+        MAST_IMAGING,
+        TARGET_SELECTION,
+        ARM_PLANNER,
+        EPEC_SERVO,
+        CONTACT_APPROACH,
+    ];
 }

@@ -1,6 +1,11 @@
 //! Questions to the simulator that only the scenario runner may ask.
 
-use crate::{imaging::ImageData, target::Target, wire};
+use crate::{
+    imaging::ImageData,
+    target::Target,
+    wire,
+    wire::{Wire, in_range},
+};
 use serde::{Deserialize, Serialize};
 
 /// Question to `sim/truth/score`.
@@ -78,6 +83,23 @@ pub struct TruthState {
     pub rendering_wall_s: f64,
     /// Physics steps so far.
     pub steps: u64,
+    /// First uncontrolled contact: simulated time, s, and the link (from 0) that touched
+    /// something solid.
+    pub collision: Option<(f64, u32)>,
+}
+
+/// Question to `sim/step`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct StepRequest {
+    /// Heartbeat periods to let pass.
+    pub periods_n: u32,
+}
+
+impl Default for StepRequest {
+    fn default() -> Self {
+        Self { periods_n: 1 }
+    }
 }
 
 /// A fault that the simulator can be told to show.
@@ -99,4 +121,11 @@ wire! {
     View = "view/1",
     TruthState = "truth_state/1",
     InjectedFault = "injected_fault/1",
+}
+
+impl Wire for StepRequest {
+    const SCHEMA: &'static str = "step_request/1";
+    fn validate(&self) -> Result<(), String> {
+        in_range("periods_n", f64::from(self.periods_n), 1.0, 100_000.0)
+    }
 }

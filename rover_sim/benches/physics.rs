@@ -1,0 +1,2 @@
+//! Speed of the physics and of whole control steps.
+fn main() {}

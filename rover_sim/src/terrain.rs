@@ -1,0 +1,119 @@
+//! Ground and rocks. The meshes made here are both drawn and touched.
+
+use crate::description::{RockDescription, TerrainDescription};
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rover_render::{Mesh, StaticMesh, Surface, shapes};
+
+/// Finest undulation that the ground's cells can carry, cells.
+const FINEST_CELLS: f64 = 4.0;
+/// No scattered rock nearer to the origin along x, m: the mount stands there.
+const CLEAR_M: f64 = 0.25;
+
+/// The ground's mesh and that of every rock, world frame. The first is the ground, then come the
+/// described rocks in their order, then the scattered ones.
+#[derive(Clone, Debug)]
+pub struct Terrain {
+    /// Shapes and surfaces.
+    pub bodies: Vec<StaticMesh>,
+    /// How many of the bodies are rocks.
+    pub rocks_n: usize,
+}
+
+impl Terrain {
+    /// Name of a body for messages.
+    pub fn name(index: usize) -> String {
+        if index == 0 {
+            "ground".into()
+        } else {
+            format!("rock {}", index - 1)
+        }
+    }
+
+    /// Index of the body that is rock `rock_n`.
+    pub fn rock(&self, rock_n: u32) -> Option<usize> {
+        let index = rock_n as usize;
+        (index < self.rocks_n).then_some(index + 1)
+    }
+
+    /// Makes the terrain; the description has been checked.
+    pub(crate) fn new(d: &TerrainDescription) -> Self {
+        let height = |x: f64, y: f64| ground_height_m(d, x, y);
+        let axis = |i: usize| {
+            let cells = (d.size_m[i] / d.cell_m).round().max(1.0) as usize;
+            let (low, step) = (
+                d.centre_m[i] - d.size_m[i] / 2.0,
+                d.size_m[i] / cells as f64,
+            );
+            (0..=cells)
+                .map(|k| low + step * k as f64)
+                .collect::<Vec<_>>()
+        };
+        let ground = StaticMesh {
+            mesh: shapes::heightfield_mesh(&axis(0), &axis(1), height),
+            surface: Surface::ground(texture_seed(d.seed)),
+        };
+        let mut bodies = vec![ground];
+        bodies.extend(d.rocks.iter().map(rock));
+        bodies.extend(scattered(d).iter().map(rock));
+        Self {
+            rocks_n: bodies.len() - 1,
+            bodies,
+        }
+    }
+}
+
+/// Height of the ground, world frame, m.
+fn ground_height_m(d: &TerrainDescription, x: f64, y: f64) -> f64 {
+    let span = d.relief_wavelength_m / (FINEST_CELLS * d.cell_m);
+    let octaves = if span > 1.0 {
+        span.log2().floor() as u32 + 1
+    } else {
+        1
+    };
+    let p = Vector3::new(x, y, 0.0) / d.relief_wavelength_m;
+    // Two standard deviations of one octave of this noise are about 1.
+    let noise = shapes::fractal_noise(&p, d.seed, octaves, d.relief_gain);
+    d.height_m + 2.0 * d.relief_m * noise
+}
+
+fn texture_seed(seed: u64) -> u32 {
+    (seed ^ (seed >> 32)) as u32
+}
+
+fn rock(d: &RockDescription) -> StaticMesh {
+    let mesh = shapes::rock(d.seed, d.radius_m, d.subdivisions_n, d.roughness);
+    let position = Vector3::from(d.position_m);
+    let place = Isometry3::from_parts(position.into(), UnitQuaternion::identity());
+    StaticMesh {
+        mesh: Mesh::transformed(&mesh, &place),
+        surface: Surface::rock(texture_seed(d.seed)),
+    }
+}
+
+fn scattered(d: &TerrainDescription) -> Vec<RockDescription> {
+    let mut random = ChaCha8Rng::seed_from_u64(d.seed);
+    let s = &d.scattered;
+    (0..s.count_n)
+        .map(|i| {
+            let [u, v, w]: [f64; 3] = std::array::from_fn(|_| random.random());
+            let low = (d.centre_m[0] - d.size_m[0] / 2.0).max(CLEAR_M);
+            let high = d.centre_m[0] + d.size_m[0] / 2.0;
+            let x = low + u * (high - low);
+            let y = d.centre_m[1] + (v - 0.5) * d.size_m[1];
+            // Many small ones, few large ones.
+            let radius_m = s.radius_m[0] * (s.radius_m[1] / s.radius_m[0]).powf(w * w);
+            RockDescription {
+                position_m: [x, y, ground_height_m(d, x, y) + 0.2 * radius_m],
+                radius_m,
+                roughness: 0.3,
+                subdivisions_n: s.subdivisions_n,
+                seed: d
+                    .seed
+                    .wrapping_mul(0x9e37_79b9_7f4a_7c15)
+                    .wrapping_add(u64::from(i)),
+            }
+        })
+        .collect()
+}

@@ -1,0 +1,121 @@
+//! An arm and a floor for tests of the physics alone.
+
+use crate::{arm::ArmModel, description::ContactDescription};
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+use rover_kinematics::{Arm, DhRow, JointLimits};
+use rover_robot::{Capsule, ContactSwitch, LinkDynamics};
+use std::f64::consts::{FRAC_PI_2, PI};
+
+/// The arm of the Mars Exploration Rover with its z axis down, 0.6 m above the ground.
+pub fn arm_model() -> ArmModel {
+    let a = [0.062443, 0.353552, 0.330349, 0.0, 0.0];
+    let d = [0.048494, 0.0, 0.0, -0.098924, -0.077131];
+    let alpha = [FRAC_PI_2, 0.0, 0.0, -FRAC_PI_2, FRAC_PI_2];
+    let mass = [1.0, 1.2, 0.9, 0.5, 0.8];
+    let com = [
+        [-0.03, -0.024, 0.0],
+        [-0.18, 0.0, 0.0],
+        [-0.165, 0.0, 0.0],
+        [0.0, -0.05, 0.0],
+        [0.0, 0.0, 0.03],
+    ];
+    let inertia = [
+        [2e-3, 2e-3, 2e-3],
+        [1e-3, 12e-3, 12e-3],
+        [1e-3, 9e-3, 9e-3],
+        [1e-3; 3],
+        [1.5e-3, 1.5e-3, 1e-3],
+    ];
+    let stiffness = [12e3, 8e3, 8e3, 6e3, 6e3];
+    let rows = (0..5)
+        .map(|i| DhRow {
+            a_m: a[i],
+            alpha_rad: alpha[i],
+            d_m: d[i],
+            theta_offset_rad: 0.0,
+        })
+        .collect();
+    let limits = (0..5)
+        .map(|_| JointLimits {
+            lower_rad: -3.4,
+            upper_rad: 3.4,
+            max_rate_rad_s: 0.4,
+            max_acceleration_rad_s2: 0.8,
+        })
+        .collect();
+    ArmModel {
+        arm: Arm::new(rows, limits).unwrap(),
+        world_from_base: Isometry3::from_parts(
+            Vector3::new(0.06, 0.16, 0.60).into(),
+            UnitQuaternion::from_euler_angles(PI, 0.0, 0.0),
+        ),
+        links: (0..5)
+            .map(|i| LinkDynamics {
+                mass_kg: mass[i],
+                com_m: com[i],
+                inertia_kg_m2: inertia[i],
+                stiffness_nm_rad: stiffness[i],
+                damping_nms_rad: stiffness[i] / 100.0,
+                max_torque_nm: 60.0,
+            })
+            .collect(),
+        shapes: vec![
+            vec![],
+            vec![Capsule {
+                from_m: [-0.353552, 0.0, 0.0],
+                to_m: [0.0; 3],
+                radius_m: 0.028,
+            }],
+            vec![Capsule {
+                from_m: [-0.330349, 0.0, 0.0],
+                to_m: [0.0; 3],
+                radius_m: 0.024,
+            }],
+            vec![Capsule {
+                from_m: [0.0, -0.098924, 0.0],
+                to_m: [0.0; 3],
+                radius_m: 0.026,
+            }],
+            vec![Capsule {
+                from_m: [0.0; 3],
+                to_m: [0.0, 0.0, 0.108],
+                radius_m: 0.016,
+            }],
+        ],
+        body: vec![],
+        tip_in_link: Vector3::new(0.0, 0.0, 0.1306),
+        axis_in_link: Vector3::z_axis(),
+        switch: ContactSwitch {
+            ball_radius_m: 0.002,
+            closes_at_m: 0.002,
+            travel_m: 0.004,
+            spring_n_m: 1000.0,
+            preload_n: 1.0,
+        },
+        contact: ContactDescription::default(),
+        gravity_m_s2: Vector3::new(0.0, 0.0, -9.81),
+        step_s: 0.002,
+    }
+}
+
+/// A posture with the instrument pointing down, its tip 0.15 m above the ground.
+pub const READY: [f64; 5] = [0.125, 0.1, 0.7, -2.371, -1.5708];
+
+/// A square of ground, 2 m wide, of `2 * n * n` triangles, at height `z_m`.
+pub fn floor(z_m: f64, n: u32) -> (Vec<Vector3<f64>>, Vec<[u32; 3]>) {
+    let mut positions = Vec::new();
+    let mut triangles = Vec::new();
+    for j in 0..=n {
+        for i in 0..=n {
+            let x = f64::from(i) / f64::from(n) * 2.0 - 0.5;
+            let y = f64::from(j) / f64::from(n) * 2.0 - 1.0;
+            positions.push(Vector3::new(x, y, z_m));
+            if i < n && j < n {
+                let k = j * (n + 1) + i;
+                triangles.push([k, k + 1, k + n + 2]);
+                triangles.push([k, k + n + 2, k + n + 1]);
+            }
+        }
+    }
+    (positions, triangles)
+}

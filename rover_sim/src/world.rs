@@ -1,0 +1,669 @@
+//! The simulated world: the true robot, its driver, what it touches and what it sees.
+//!
+//! A plain value: no network, no threads, no clock but the steps that it is told to make. Two
+//! worlds built from the same description and seed and told the same give the same bits.
+
+use crate::{
+    SimulationError,
+    arm::{ArmModel, ArmPhysics, StaticSurface, TipContact},
+    check,
+    contact_switch::Switch,
+    description::{Moment as FaultMoment, SimulationDescription},
+    driver::{Driver, Phase},
+    eyes::{Eyes, Moment, SurfacePoint},
+    statics,
+    terrain::Terrain,
+    truth::Truth,
+};
+use nalgebra::{Unit, Vector3};
+use rover_kinematics::JointTrajectory;
+use rover_messages::{
+    Fault,
+    arm::{ArmState, ExecuteResult, Guard, Motion, StopReason},
+    imaging::RawPair,
+    keys::service::HARDWARE,
+    simulation::{InjectedFault, TruthState, View, ViewRequest},
+};
+use rover_render::FrameState;
+use rover_robot::Robot;
+use std::{
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::Instant,
+};
+
+/// Trajectories must begin and end slower than this, rad/s.
+const REST_RATE_RAD_S: f64 = 1e-3;
+/// Consecutive steps below the rest rate that count as rest.
+const REST_STEPS: u32 = 5;
+/// Force on a link above which it counts as touching something, N.
+const TOUCH_N: f64 = 0.01;
+
+/// What a granted period led to.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Advance {
+    /// No motion was under way; time has passed.
+    Idle,
+    /// The motion goes on.
+    Moving,
+    /// The motion has ended and the arm is at rest.
+    Ended(Result<ExecuteResult, Fault>),
+}
+
+/// The first touch of the instrument on the terrain.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Touch {
+    /// Where the ball touched, world frame, m.
+    pub point_m: Vector3<f64>,
+    /// The instrument's axis at that moment, world frame.
+    pub axis: Unit<Vector3<f64>>,
+}
+
+/// Something other than the plunger's ball touched the terrain or the robot's body.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Collision {
+    /// Simulated time of the first touch, s.
+    pub sim_time_s: f64,
+    /// The link, from 0.
+    pub link_n: usize,
+    /// Largest force so far, N.
+    pub force_n: f64,
+}
+
+/// What is kept of the motion under way.
+#[derive(Default)]
+struct Record {
+    started_closed: bool,
+    peak_force_n: f64,
+    joints_at_contact_rad: Option<Vec<f64>>,
+    stopped_at_s: Option<f64>,
+    still_at_s: Option<f64>,
+    calm_steps: u32,
+    settling_steps: u64,
+}
+
+/// The simulated world.
+pub struct World {
+    pub(crate) robot: Arc<Robot>,
+    pub(crate) truth: Truth,
+    pub(crate) model: ArmModel,
+    description: SimulationDescription,
+    terrain: Arc<Terrain>,
+    arm: ArmPhysics,
+    driver: Driver,
+    switch: Switch,
+    eyes: Arc<Mutex<Eyes>>,
+    step: u64,
+    joints_rad: Vec<f64>,
+    rates_rad_s: Vec<f64>,
+    tip: Option<TipContact>,
+    touch: Option<Touch>,
+    pub(crate) contact: Option<Touch>,
+    collision: Option<Collision>,
+    record: Record,
+    gone: Vec<usize>,
+    fiducial_hidden: bool,
+    has_moved: bool,
+    designated: Option<((String, [u64; 2]), SurfacePoint)>,
+    physics_wall_s: f64,
+    rendering_wall: Arc<AtomicU64>,
+    /// What the world was built from.
+    origin: (u64, Vec<f64>),
+}
+
+impl World {
+    /// Builds the world with the arm at rest at encoder angles `start_rad`.
+    ///
+    /// # Errors
+    /// [`SimulationError`] with the field, what was found and what was expected.
+    pub fn new(
+        robot: Arc<Robot>,
+        description: &SimulationDescription,
+        seed: u64,
+        start_rad: &[f64],
+    ) -> Result<Self, SimulationError> {
+        check::description(description, &robot, start_rad)?;
+        let truth = Truth::draw(&robot, &description.truth, seed)?;
+        let model = arm_model(&robot, &truth, description)?;
+        let terrain = Arc::new(Terrain::new(&description.terrain));
+        let surfaces: Vec<StaticSurface<'_>> = terrain
+            .bodies
+            .iter()
+            .enumerate()
+            .map(|(i, body)| StaticSurface {
+                name: Terrain::name(i),
+                positions: &body.mesh.positions,
+                triangles: &body.mesh.triangles,
+            })
+            .collect();
+        let drooped = statics::drooped_angles_rad(&model, start_rad)?;
+        let mut arm = ArmPhysics::new(&model, &surfaces, &drooped)?;
+        arm.set_rest(start_rad);
+        let driver = Driver::new(
+            model.arm.limits(),
+            &model.links,
+            description.driver,
+            description.step_s,
+            truth.backlash_rad,
+            start_rad,
+        );
+        let s = &model.switch;
+        let switch = Switch {
+            closes_at_m: s.closes_at_m,
+            opens_at_m: s.closes_at_m - description.contact.hysteresis_m,
+            dead: description.faults.switch_dead,
+            closed: false,
+        };
+        let eyes = Eyes::new(&robot, &truth, terrain.clone(), description, seed)?;
+        let rendering_wall = eyes.wall_ns.clone();
+        let mut world = Self {
+            robot,
+            truth,
+            model,
+            description: description.clone(),
+            terrain,
+            arm,
+            driver,
+            switch,
+            eyes: Arc::new(Mutex::new(eyes)),
+            step: 0,
+            joints_rad: drooped,
+            rates_rad_s: vec![0.0; start_rad.len()],
+            tip: None,
+            touch: None,
+            contact: None,
+            collision: None,
+            record: Record::default(),
+            gone: Vec::new(),
+            fiducial_hidden: description.faults.fiducial_hidden,
+            has_moved: false,
+            designated: None,
+            physics_wall_s: 0.0,
+            rendering_wall,
+            origin: (seed, start_rad.to_vec()),
+        };
+        world.come_to_rest();
+        if let Some(target) = &description.target {
+            world.designate(&target.pair, target.pixel_px)?;
+        }
+        Ok(world)
+    }
+
+    /// Lets the arm settle before time begins.
+    fn come_to_rest(&mut self) {
+        let limit = (self.description.driver.settle_limit_s / self.description.step_s) as u64;
+        for _ in 0..limit {
+            self.physics_step();
+            self.record.calm_steps = if self.is_calm() {
+                self.record.calm_steps + 1
+            } else {
+                0
+            };
+            if self.record.calm_steps >= REST_STEPS {
+                break;
+            }
+        }
+        self.step = 0;
+        self.record = Record::default();
+        (self.touch, self.collision) = (None, None);
+        self.observe_contacts();
+    }
+
+    /// Starts all over: the same world, truth and arm posture, time zero.
+    ///
+    /// # Errors
+    /// Fault `busy` while a motion is under way.
+    pub fn reset(&mut self) -> Result<(), Fault> {
+        if self.is_moving() {
+            return Err(Fault::new(HARDWARE, "busy", "a motion is under way"));
+        }
+        let (seed, start_rad) = &self.origin;
+        *self = Self::new(self.robot.clone(), &self.description, *seed, start_rad)
+            .map_err(|e| Fault::new(HARDWARE, "reset_failed", e.to_string()))?;
+        Ok(())
+    }
+
+    /// The believed robot.
+    pub fn robot(&self) -> &Arc<Robot> {
+        &self.robot
+    }
+
+    /// The effective description.
+    pub fn description(&self) -> &SimulationDescription {
+        &self.description
+    }
+
+    /// Simulated time, s.
+    pub fn sim_time_s(&self) -> f64 {
+        self.step as f64 * self.description.step_s
+    }
+
+    /// Control steps since the start.
+    pub fn step_count(&self) -> u64 {
+        self.step
+    }
+
+    /// Whether a motion is under way.
+    pub fn is_moving(&self) -> bool {
+        self.driver.phase != Phase::Idle
+    }
+
+    /// Names the pixel of the target: its true surface point is found now, before anything moves
+    /// or vanishes, and is what occlusion and scores refer to.
+    ///
+    /// # Errors
+    /// [`SimulationError::NoSurface`].
+    pub fn designate(
+        &mut self,
+        pair: &str,
+        pixel_px: [f64; 2],
+    ) -> Result<SurfacePoint, SimulationError> {
+        let key = (pair.to_owned(), pixel_px.map(f64::to_bits));
+        if let Some((known, point)) = &self.designated
+            && *known == key
+        {
+            return Ok(*point);
+        }
+        let point = lock(&self.eyes).surface_at(pair, pixel_px)?;
+        self.designated = Some((key, point));
+        Ok(point)
+    }
+
+    /// Begins a motion.
+    ///
+    /// # Errors
+    /// Fault `busy`, `trajectory_invalid` (with the kinematics' words) or `start_mismatch` (with
+    /// the joint, the angle found and the angle expected).
+    pub fn start(&mut self, trajectory: JointTrajectory, guard: Guard) -> Result<(), Fault> {
+        let refuse = |name, message| Err(Fault::new(HARDWARE, name, message));
+        if self.is_moving() {
+            return refuse(
+                "busy",
+                "a motion is under way; stop it or wait for its end".into(),
+            );
+        }
+        if let Err(e) = trajectory.validate(&self.robot.arm) {
+            return refuse("trajectory_invalid", e.to_string());
+        }
+        let (Some(first), Some(last)) = (trajectory.points.first(), trajectory.points.last())
+        else {
+            return refuse("trajectory_invalid", "no points".into());
+        };
+        for (what, point) in [("first", first), ("last", last)] {
+            if let Some(j) = point
+                .qd_rad_s
+                .iter()
+                .position(|r| r.abs() > REST_RATE_RAD_S)
+            {
+                let rate = point.qd_rad_s[j];
+                let message =
+                    format!("the {what} point moves joint {j} at {rate} rad/s, expected rest");
+                return refuse("trajectory_invalid", message);
+            }
+        }
+        let tolerance =
+            self.description.driver.start_tolerance_rad + 6.0 * self.truth.encoder_noise_rad;
+        for (joint, (found, &present)) in first.q_rad.iter().zip(&self.driver.motor_rad).enumerate()
+        {
+            let apart = found - present;
+            if apart.abs() > tolerance {
+                let message = format!(
+                    "the trajectory starts joint {joint} at {found} rad, the encoder reads \
+                     {present} rad; expected within {tolerance} rad"
+                );
+                return Err(Fault::new(HARDWARE, "start_mismatch", message)
+                    .with("joint_n", joint as f64)
+                    .with("apart_rad", apart));
+            }
+        }
+        self.driver.start(trajectory, guard);
+        self.record = Record {
+            started_closed: self.switch.closed,
+            ..Record::default()
+        };
+        if !self.has_moved {
+            self.has_moved = true;
+            self.vanish(|when| matches!(when, FaultMoment::FirstArmMotion));
+        }
+        Ok(())
+    }
+
+    /// Stops a motion: the motors slow down along the trajectory, within their acceleration if
+    /// that takes no longer than the driver's stop ramp. Time must be granted by
+    /// [`Self::advance`] until the motion has ended.
+    pub fn stop(&mut self, reason: StopReason) {
+        if self.driver.phase == Phase::Following {
+            self.record.stopped_at_s = Some(self.sim_time_s());
+            self.driver.stop(reason);
+        }
+    }
+
+    /// Grants heartbeat periods; ends early, in the very step, when a motion ends.
+    pub fn advance(&mut self, periods: u32) -> Advance {
+        let start = Instant::now();
+        let steps = u64::from(periods) * self.steps_per_period();
+        let mut outcome = if self.is_moving() {
+            Advance::Moving
+        } else {
+            Advance::Idle
+        };
+        for _ in 0..steps {
+            self.physics_step();
+            if outcome == Advance::Moving
+                && let Some(ended) = self.supervise()
+            {
+                outcome = Advance::Ended(ended);
+                break;
+            }
+        }
+        self.physics_wall_s += start.elapsed().as_secs_f64();
+        outcome
+    }
+
+    /// Control steps in one heartbeat period.
+    pub fn steps_per_period(&self) -> u64 {
+        (self.robot.description().arm.heartbeat_s / self.description.step_s).round() as u64
+    }
+
+    /// One step of driver and physics, and what contacts and switch do in it.
+    fn physics_step(&mut self) {
+        self.driver.advance(&self.joints_rad);
+        self.arm.set_rest(&self.driver.rest_rad);
+        self.arm.step();
+        self.step += 1;
+        self.arm.read(&mut self.joints_rad, &mut self.rates_rad_s);
+        self.observe_contacts();
+        let now = self.sim_time_s();
+        self.vanish(|when| matches!(when, FaultMoment::AtTimeS(t) if *t <= now));
+    }
+
+    fn observe_contacts(&mut self) {
+        let contacts = self.arm.contacts();
+        self.tip = contacts.tip;
+        self.touch = match (contacts.tip, self.touch) {
+            (None, _) => None,
+            (Some(_), Some(touch)) => Some(touch),
+            (Some(tip), None) => {
+                let axis = self.arm.world_from_plunger().rotation * Vector3::z_axis();
+                Some(Touch {
+                    point_m: tip.point_m,
+                    axis,
+                })
+            }
+        };
+        if let Some((link_n, force_n)) = contacts.elsewhere.filter(|(_, f)| *f > TOUCH_N) {
+            let sim_time_s = self.sim_time_s();
+            let collision = self.collision.get_or_insert(Collision {
+                sim_time_s,
+                link_n,
+                force_n,
+            });
+            collision.force_n = collision.force_n.max(force_n);
+        }
+        if self.switch.update(self.arm.switch_travel_m()) {
+            // The first closing is the placement; a retract and another approach replace it.
+            self.contact = self.touch;
+            if !self.record.started_closed && self.record.joints_at_contact_rad.is_none() {
+                self.record.joints_at_contact_rad = Some(self.encoder_angles_rad());
+                self.stop(StopReason::Contact);
+            }
+        }
+    }
+
+    /// Watches force and rest; the outcome when the motion has ended.
+    fn supervise(&mut self) -> Option<Result<ExecuteResult, Fault>> {
+        let force_n = self.tip_force_n();
+        self.record.peak_force_n = self.record.peak_force_n.max(force_n);
+        if let Some(limit_n) = self.driver.max_force_n()
+            && force_n > limit_n
+        {
+            self.stop(StopReason::Force {
+                found_n: force_n,
+                limit_n,
+            });
+        }
+        if self.driver.phase != Phase::Settling {
+            return None;
+        }
+        let now = self.sim_time_s();
+        self.record.still_at_s.get_or_insert(now);
+        self.record.settling_steps += 1;
+        self.record.calm_steps = if self.is_calm() {
+            self.record.calm_steps + 1
+        } else {
+            0
+        };
+        if self.record.calm_steps >= REST_STEPS {
+            return Some(self.conclude());
+        }
+        let waited_s = self.record.settling_steps as f64 * self.description.step_s;
+        if waited_s < self.description.driver.settle_limit_s {
+            return None;
+        }
+        let fastest = self
+            .rates_rad_s
+            .iter()
+            .fold(0.0, |m: f64, r| m.max(r.abs()));
+        self.driver.finish();
+        let message = format!("the arm does not come to rest: {fastest} rad/s after {waited_s} s");
+        Some(Err(Fault::new(HARDWARE, "arm_not_at_rest", message)
+            .with("rate_rad_s", fastest)
+            .with("waited_s", waited_s)))
+    }
+
+    fn is_calm(&self) -> bool {
+        let limit = self.description.driver.rest_rate_rad_s;
+        self.rates_rad_s.iter().all(|r| r.abs() < limit)
+    }
+
+    /// Ends the motion; a stop on contact or force is a result, any other stop a fault.
+    fn conclude(&mut self) -> Result<ExecuteResult, Fault> {
+        self.driver.finish();
+        let record = std::mem::take(&mut self.record);
+        let state = self.state();
+        let reason = state.stop_reason.clone();
+        let name = match &reason {
+            None | Some(StopReason::Contact | StopReason::Force { .. }) => {
+                return Ok(ExecuteResult {
+                    completed: reason.is_none(),
+                    peak_force_n: record.peak_force_n,
+                    joints_at_contact_rad: record.joints_at_contact_rad,
+                    state,
+                });
+            }
+            Some(StopReason::Deviation { .. }) => "path_deviation",
+            Some(StopReason::Cancelled) => "cancelled",
+            Some(StopReason::StopCommand) => "stopped",
+            Some(StopReason::CommanderLost { .. }) => "commander_lost",
+        };
+        let message = reason.map_or_else(String::new, |r| format!("the arm was stopped: {r}"));
+        let mut fault = Fault::new(HARDWARE, name, message);
+        if let (Some(stop), Some(still)) = (record.stopped_at_s, record.still_at_s) {
+            fault = fault
+                .with("still_after_ms", (still - stop) * 1e3)
+                .with("rest_after_ms", (self.sim_time_s() - stop) * 1e3);
+        }
+        Err(fault)
+    }
+
+    fn tip_force_n(&self) -> f64 {
+        self.tip.map_or(0.0, |t| t.axial_force_n.max(0.0))
+    }
+
+    fn encoder_angles_rad(&self) -> Vec<f64> {
+        let noise = self.truth.encoder_noise(self.step);
+        self.driver
+            .motor_rad
+            .iter()
+            .zip(noise)
+            .map(|(q, n)| q + n)
+            .collect()
+    }
+
+    /// The arm as its encoders and switch report it.
+    pub fn state(&self) -> ArmState {
+        ArmState {
+            sim_time_s: self.sim_time_s(),
+            step: self.step,
+            joints_rad: self.encoder_angles_rad(),
+            rates_rad_s: self.driver.motor_rate_rad_s.clone(),
+            contact: self.switch.closed,
+            switch_travel_m: self.arm.switch_travel_m().max(0.0),
+            tip_force_n: self.tip_force_n(),
+            motion: match self.driver.phase {
+                Phase::Idle => Motion::Idle,
+                Phase::Ramping => Motion::Stopping,
+                Phase::Settling if self.driver.stop_reason.is_some() => Motion::Stopping,
+                Phase::Following | Phase::Settling => Motion::Moving,
+            },
+            stop_reason: self.driver.stop_reason.clone(),
+        }
+    }
+
+    /// Time since the start of the motion under way, s.
+    pub fn elapsed_s(&self) -> f64 {
+        self.driver.elapsed_s()
+    }
+
+    /// The first uncontrolled contact so far.
+    pub fn collision(&self) -> Option<Collision> {
+        self.collision
+    }
+
+    /// The scene at this instant.
+    pub fn moment(&self) -> Moment {
+        let mut part_poses: Vec<_> = (0..self.model.links.len())
+            .map(|i| self.arm.world_from_link(i))
+            .collect();
+        part_poses.push(self.arm.world_from_plunger());
+        Moment {
+            sim_time_s: self.sim_time_s(),
+            step: self.step,
+            frame: FrameState {
+                part_poses,
+                pattern_visible: !self.is_fiducial_hidden(),
+            },
+            gone: self.gone.clone(),
+        }
+    }
+
+    fn is_fiducial_hidden(&self) -> bool {
+        let occluded = match (&self.description.occlusion, &self.designated) {
+            (Some(o), Some((_, target))) => {
+                let apart = (self.arm.tip_in_world() - target.point_m).norm();
+                apart < o.fiducial_hidden_within_m
+            }
+            _ => false,
+        };
+        self.fiducial_hidden || occluded
+    }
+
+    /// The cameras, shared: pictures of a [`Moment`] can be taken while the world goes on.
+    pub fn eyes(&self) -> Arc<Mutex<Eyes>> {
+        self.eyes.clone()
+    }
+
+    /// Takes one stereo pair now.
+    ///
+    /// # Errors
+    /// As [`Eyes::grab`].
+    pub fn grab(&self, pair: &str, exposure_n: u32) -> Result<RawPair, Fault> {
+        lock(&self.eyes).grab(&self.moment(), pair, exposure_n)
+    }
+
+    /// What an outside camera sees now.
+    ///
+    /// # Errors
+    /// As [`Eyes::view`].
+    pub fn view(&self, request: &ViewRequest) -> Result<View, Fault> {
+        lock(&self.eyes).view(&self.moment(), request)
+    }
+
+    /// What the simulator knows about the truth.
+    pub fn truth_state(&self) -> TruthState {
+        TruthState {
+            sim_time_s: self.sim_time_s(),
+            tip_in_world_m: self.arm.tip_in_world().into(),
+            joints_rad: self.joints_rad.clone(),
+            physics_wall_s: self.physics_wall_s,
+            rendering_wall_s: self.rendering_wall.load(Ordering::Relaxed) as f64 * 1e-9,
+            steps: self.step,
+            collision: self.collision.map(|c| (c.sim_time_s, c.link_n as u32)),
+        }
+    }
+
+    /// The true position of the tip (plunger released), world frame, m.
+    pub fn tip_in_world(&self) -> Vector3<f64> {
+        self.arm.tip_in_world()
+    }
+
+    /// Shows a fault from now on.
+    ///
+    /// # Errors
+    /// Fault `unknown_rock` with the number of rocks there are.
+    pub fn inject(&mut self, fault: &InjectedFault) -> Result<(), Fault> {
+        match fault {
+            InjectedFault::FiducialHidden(hidden) => self.fiducial_hidden = *hidden,
+            InjectedFault::SwitchDead(dead) => self.switch.dead = *dead,
+            InjectedFault::RockVanishes(rock_n) => {
+                let body = self.terrain.rock(*rock_n).ok_or_else(|| {
+                    let message = format!("rock {rock_n}, expected below {}", self.terrain.rocks_n);
+                    Fault::new(HARDWARE, "unknown_rock", message)
+                })?;
+                self.remove_body(body);
+            }
+        }
+        Ok(())
+    }
+
+    /// Lets the described rock vanish if its moment has come.
+    fn vanish(&mut self, has_come: impl Fn(&FaultMoment) -> bool) {
+        if let Some(fault) = self.description.faults.rock_vanishes
+            && has_come(&fault.when)
+            && let Some(body) = self.terrain.rock(fault.rock_n)
+        {
+            self.remove_body(body);
+        }
+    }
+
+    fn remove_body(&mut self, body: usize) {
+        if self.arm.remove_surface(body) {
+            self.gone.push(body);
+        }
+    }
+}
+
+/// The lock even if a thread panicked while it held it: every picture is made anew.
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The true arm for rapier.
+fn arm_model(
+    robot: &Robot,
+    truth: &Truth,
+    description: &SimulationDescription,
+) -> Result<ArmModel, SimulationError> {
+    let d = robot.description();
+    let dynamics = d.dynamics.as_ref().ok_or_else(|| SimulationError::Robot {
+        robot: d.name.clone(),
+        field: "dynamics".into(),
+        message: "missing; a simulator needs masses and stiffnesses".into(),
+    })?;
+    let droop = if description.truth.droop { 1.0 } else { 0.0 };
+    Ok(ArmModel {
+        arm: truth.arm.clone(),
+        world_from_base: truth.world_from_base,
+        links: dynamics.links.clone(),
+        shapes: d.arm.joints.iter().map(|j| j.shape.clone()).collect(),
+        body: d.body.clone(),
+        tip_in_link: robot.tool.tip_in_link,
+        axis_in_link: robot.tool.axis_in_link,
+        switch: d.tool.switch,
+        contact: description.contact,
+        gravity_m_s2: Vector3::from(dynamics.gravity_m_s2) * droop,
+        step_s: description.step_s,
+    })
+}
