@@ -56,9 +56,9 @@ impl Cahv {
 
     #[inline]
     pub(crate) fn ray(&self, pixel_px: &Vector2<f64>) -> Result<Ray, CameraError> {
-        ray_from(
+        ray_along(
             &self.c,
-            linear::direction(&self.a, &self.h, &self.v, pixel_px),
+            &linear::direction(&self.a, &self.h, &self.v, pixel_px),
         )
     }
 
@@ -102,6 +102,12 @@ pub(crate) fn finite_pixel(pixel_px: Vector2<f64>) -> Result<Vector2<f64>, Camer
     } else {
         Err(CameraError::NotFinite)
     }
+}
+
+/// A ray from a direction of any length.
+#[inline]
+pub(crate) fn ray_along(origin: &Vector3<f64>, along: &Vector3<f64>) -> Result<Ray, CameraError> {
+    ray_from(origin, along * (1.0 / along.norm()))
 }
 
 /// A ray from a direction that is a unit vector unless an input was not finite.

@@ -1,6 +1,6 @@
 //! CAHVOR: CAHV behind a lens with radial distortion about its own optical axis (Gennery 1993).
 
-use crate::cahv::{behind, finite_pixel, ray_from};
+use crate::cahv::{behind, finite_pixel, ray_along, ray_from};
 use crate::radial::{Radial, RadialError};
 use crate::{CameraError, Projection, Ray, linear};
 use nalgebra::{Isometry3, Matrix3, Matrix3x2, Point3, Vector2, Vector3};
@@ -130,7 +130,7 @@ impl Cahvor {
         })
     }
 
-    /// Takes the distortion out of the unit direction `distorted`; also returns the pieces that
+    /// Takes the distortion out of the direction `distorted` (any length); also returns the pieces that
     /// the derivative needs.
     #[inline]
     fn undistort(
@@ -171,7 +171,9 @@ impl Cahvor {
     ) -> CameraError {
         let off_axis_rad = across.norm().atan2(along);
         match *reason {
-            _ if !off_axis_rad.is_finite() => CameraError::NotFinite,
+            _ if !off_axis_rad.is_finite() || (along == 0.0 && *across == Vector3::zeros()) => {
+                CameraError::NotFinite
+            }
             RadialError::Outside => {
                 let limit = Radial(&self.r).distorted_limit().unwrap_or(f64::INFINITY);
                 outside(off_axis_rad, limit)
@@ -191,7 +193,7 @@ impl Cahvor {
     pub(crate) fn ray(&self, pixel_px: &Vector2<f64>) -> Result<Ray, CameraError> {
         let distorted = linear::direction(&self.a, &self.h, &self.v, pixel_px);
         let direction = self.undistort(&distorted, pixel_px)?.direction;
-        ray_from(&self.c, direction / direction.norm())
+        ray_along(&self.c, &direction)
     }
 
     #[inline]
@@ -243,7 +245,7 @@ impl Cahvor {
     }
 }
 
-/// A distorted unit direction split along the optical axis, and its undistorted form.
+/// A distorted direction split along the optical axis, and its undistorted form.
 struct Undistorted {
     along: f64,
     across: Vector3<f64>,

@@ -15,7 +15,8 @@ pub(crate) fn image(
     d: &Vector3<f64>,
     range_m: f64,
 ) -> Vector2<f64> {
-    Vector2::new(d.dot(h) / range_m, d.dot(v) / range_m)
+    let inverse = 1.0 / range_m;
+    Vector2::new(d.dot(h) * inverse, d.dot(v) * inverse)
 }
 
 /// Derivative of [`image`] with respect to `d`, px/m: rows `(H - u A) / range`,
@@ -28,13 +29,13 @@ pub(crate) fn image_jacobian(
     pixel_px: &Vector2<f64>,
     range_m: f64,
 ) -> Matrix2x3<f64> {
-    let du = (h - a * pixel_px.x) / range_m;
-    let dv = (v - a * pixel_px.y) / range_m;
+    let inverse = 1.0 / range_m;
+    let du = (h - a * pixel_px.x) * inverse;
+    let dv = (v - a * pixel_px.y) * inverse;
     Matrix2x3::new(du.x, du.y, du.z, dv.x, dv.y, dv.z)
 }
 
-/// The unit direction through a pixel, pointing forward along A. It holds NaN if the vectors do
-/// not span space or are not finite.
+/// A direction through a pixel, of any length, pointing forward along A.
 #[inline]
 pub(crate) fn direction(
     a: &Vector3<f64>,
@@ -43,10 +44,11 @@ pub(crate) fn direction(
     pixel_px: &Vector2<f64>,
 ) -> Vector3<f64> {
     let normal = (v - a * pixel_px.y).cross(&(h - a * pixel_px.x));
-    normal * (forward_sign(a, &normal) / normal.norm())
+    normal * forward_sign(a, &normal)
 }
 
-/// [`direction`] with its derivative with respect to the pixel, 1/px.
+/// The unit vector along [`direction`] with its derivative with respect to the pixel, 1/px. Both
+/// hold NaN if the vectors do not span space or are not finite.
 #[inline]
 pub(crate) fn direction_with_jacobian(
     a: &Vector3<f64>,

@@ -20,9 +20,12 @@ pub(crate) enum RadialError {
 #[derive(Clone, Copy)]
 pub(crate) struct Radial<'a>(pub(crate) &'a Vector3<f64>);
 
-/// Steps at which the inverse counts as settled. Newton's method doubles the digits of each step,
-/// so the error left behind is at the resolution of f64.
+/// Relative step at which the bracketed inverse counts as settled.
 const SETTLED: f64 = 1e-12;
+/// Error below which the fast inverse counts as settled: less than half the resolution of f64.
+const FAST_RESIDUE: f64 = 2e-17;
+/// Largest last step of the fast inverse if the polynomial is so flat that it hardly bends.
+const FAST_STEP: f64 = 1e-3;
 const FAST_ITERATIONS: u32 = 20;
 const SAFE_ITERATIONS: u32 = 200;
 
@@ -79,18 +82,20 @@ impl Radial<'_> {
     pub(crate) fn undistorted_ratio(self, tau: f64) -> Result<f64, RadialError> {
         let (k1, k3, k5) = (1.0 + self.0.x, self.0.y * tau, self.0.z * tau * tau);
         let mut x = 1.0 - (self.0.x + k3 + k5);
+        // A Newton step s leaves an error of about s^2 f''/(2 f'); this bounds f'' for x near 1.
+        let bend = 3.0 * k3.abs() + 10.0 * k5.abs();
         for _ in 0..FAST_ITERATIONS {
             let x2 = x * x;
             let slope = k1 + x2 * (3.0 * k3 + x2 * 5.0 * k5);
+            if !(slope > 0.0) {
+                break;
+            }
             let step = (x * (k1 + x2 * (k3 + x2 * k5)) - 1.0) / slope;
             x -= step;
-            if step.abs() < SETTLED {
+            if step * step * bend <= FAST_RESIDUE * slope && step.abs() < FAST_STEP {
                 if x > 0.0 && self.is_one_to_one(x * x * tau) {
                     return Ok(x);
                 }
-                break;
-            }
-            if !(slope > 0.0) {
                 break;
             }
         }
