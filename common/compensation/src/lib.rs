@@ -35,6 +35,10 @@ impl Compensation {
 
     /// The paper's rule: one vector, the same everywhere.
     pub fn constant(offset_m: [f64; 3]) -> Self {
-        Self { offset_m, offset_rad: [0.0; 3], parameters: Vec::new() }
+        Self {
+            offset_m,
+            offset_rad: [0.0; 3],
+            parameters: Vec::new(),
+        }
     }
 }

@@ -1,7 +1,7 @@
 //! The believed robot's error model and the commands that it leads to.
 
 use crate::Compensation;
-use nalgebra::{DVector, Isometry3, Matrix6xX, UnitQuaternion, Unit, Vector3};
+use nalgebra::{DVector, Isometry3, Matrix6xX, Unit, UnitQuaternion, Vector3};
 use rover_kinematics::{
     Arm, ArmError, AxisGoal, IkError, MOUNT_PARAMETERS, Tool, closest_solution,
     pose_error_jacobian_with_mount,
@@ -67,8 +67,9 @@ impl ErrorModel {
         q: &[f64],
         point_in_link: &Vector3<f64>,
     ) -> Result<Matrix6xX<f64>, ArmError> {
-        let mount_centre_in_base =
-            self.rover_from_arm_base.inverse_transform_point(&self.mount_centre_in_rover.into());
+        let mount_centre_in_base = self
+            .rover_from_arm_base
+            .inverse_transform_point(&self.mount_centre_in_rover.into());
         let in_base = pose_error_jacobian_with_mount(
             &self.arm,
             q,
@@ -153,13 +154,20 @@ impl ErrorModel {
                 axis: base_from_rover.rotation * command.1,
             };
             let next = closest_solution(&self.arm, &self.tool, &goal, &joints)?;
-            let moved =
-                next.iter().zip(&joints).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            let moved = next
+                .iter()
+                .zip(&joints)
+                .map(|(a, b)| (a - b).abs())
+                .fold(0.0, f64::max);
             joints = next;
             if moved < 1e-9 {
                 break;
             }
         }
-        Ok(SolvedPose { joints_rad: joints, tip_in_rover: command.0, axis_in_rover: command.1 })
+        Ok(SolvedPose {
+            joints_rad: joints,
+            tip_in_rover: command.0,
+            axis_in_rover: command.1,
+        })
     }
 }

@@ -110,7 +110,10 @@ impl<F> Point<F> {
 
 impl<F> From<Vector3<f64>> for Point<F> {
     fn from(coords: Vector3<f64>) -> Self {
-        Self { coords, frame: PhantomData }
+        Self {
+            coords,
+            frame: PhantomData,
+        }
     }
 }
 
@@ -118,7 +121,10 @@ impl<F> Direction<F> {
     /// The direction of `v`; `None` for a zero or non-finite vector.
     pub fn new(v: Vector3<f64>) -> Option<Self> {
         let unit = Unit::try_new(v, 1e-12)?;
-        unit.iter().all(|x| x.is_finite()).then_some(Self { unit, frame: PhantomData })
+        unit.iter().all(|x| x.is_finite()).then_some(Self {
+            unit,
+            frame: PhantomData,
+        })
     }
 
     /// The angle to `other`, radians, in `0..=pi`.
@@ -130,7 +136,10 @@ impl<F> Direction<F> {
 
 impl<F> From<Unit<Vector3<f64>>> for Direction<F> {
     fn from(unit: Unit<Vector3<f64>>) -> Self {
-        Self { unit, frame: PhantomData }
+        Self {
+            unit,
+            frame: PhantomData,
+        }
     }
 }
 
@@ -162,7 +171,10 @@ impl<To, From> Transform<To, From> {
 
 impl<To, From> std::convert::From<Isometry3<f64>> for Transform<To, From> {
     fn from(isometry: Isometry3<f64>) -> Self {
-        Self { isometry, frames: PhantomData }
+        Self {
+            isometry,
+            frames: PhantomData,
+        }
     }
 }
 
@@ -198,7 +210,9 @@ impl<'de, F> Deserialize<'de> for Point<F> {
         if xyz.iter().all(|x| x.is_finite()) {
             Ok(Vector3::from(xyz).into())
         } else {
-            Err(serde::de::Error::custom("a position must be three finite numbers, metres"))
+            Err(serde::de::Error::custom(
+                "a position must be three finite numbers, metres",
+            ))
         }
     }
 }

@@ -20,7 +20,9 @@ pub enum PlaneError {
     #[error("a plane needs at least 3 points, got {0}")]
     TooFewPoints(usize),
     /// The points lie on a line (or on one spot), so the normal is free.
-    #[error("the points lie on a line: their second spread is {0:.3e}, the plane is not determined")]
+    #[error(
+        "the points lie on a line: their second spread is {0:.3e}, the plane is not determined"
+    )]
     Collinear(f64),
     /// A coordinate is not a finite number.
     #[error("a point has a coordinate that is not finite")]
@@ -58,7 +60,11 @@ impl Plane {
         if normal.dot(towards) < 0.0 {
             normal = -normal;
         }
-        Ok(Self { centroid, normal, rms: small.sqrt() })
+        Ok(Self {
+            centroid,
+            normal,
+            rms: small.sqrt(),
+        })
     }
 
     /// Signed distance of `point` from the plane, positive on the normal's side.
@@ -70,7 +76,11 @@ impl Plane {
 /// Two unit vectors that span the plane orthogonal to `normal`; with it they form a right-handed
 /// basis `(first, second, normal)`. The choice is a fixed function of `normal`.
 pub fn tangent_basis(normal: &Unit<Vector3<f64>>) -> (Vector3<f64>, Vector3<f64>) {
-    let helper = if normal.x.abs() < 0.6 { Vector3::x() } else { Vector3::y() };
+    let helper = if normal.x.abs() < 0.6 {
+        Vector3::x()
+    } else {
+        Vector3::y()
+    };
     let first = (helper - normal.into_inner() * normal.dot(&helper)).normalize();
     (first, normal.cross(&first))
 }
@@ -101,8 +111,13 @@ mod tests {
 
     #[test]
     fn degenerate_points_are_refused() {
-        let line: Vec<_> = (0..5).map(|i| Vector3::new(f64::from(i), 0.0, 0.0)).collect();
-        assert!(matches!(Plane::fit(&line, &Vector3::z()), Err(PlaneError::Collinear(_))));
+        let line: Vec<_> = (0..5)
+            .map(|i| Vector3::new(f64::from(i), 0.0, 0.0))
+            .collect();
+        assert!(matches!(
+            Plane::fit(&line, &Vector3::z()),
+            Err(PlaneError::Collinear(_))
+        ));
         assert!(matches!(
             Plane::fit(&line[..2], &Vector3::z()),
             Err(PlaneError::TooFewPoints(2))

@@ -59,7 +59,11 @@ impl std::fmt::Display for StopReason {
             Self::Force { found_n, limit_n } => {
                 write!(f, "tip force {found_n:.1} N, limit {limit_n} N")
             }
-            Self::Deviation { joint_n, found_rad, limit_rad } => write!(
+            Self::Deviation {
+                joint_n,
+                found_rad,
+                limit_rad,
+            } => write!(
                 f,
                 "joint {joint_n} is {found_rad:.4} rad off its trajectory, limit {limit_rad} rad"
             ),

@@ -183,11 +183,24 @@ impl Wire for PlaceGoal {
             in_range(&format!("stations_m[{i}]"), s, 0.005, 1.0)?;
         }
         if self.stations_m.windows(2).any(|w| w[1] >= w[0]) {
-            return Err(format!("stations_m: {:?}, expected far to near", self.stations_m));
+            return Err(format!(
+                "stations_m: {:?}, expected far to near",
+                self.stations_m
+            ));
         }
         in_range("tolerance_m", self.tolerance_m, 1e-6, 0.1)?;
-        in_range("max_predicted_error_m", self.max_predicted_error_m, 1e-6, 1.0)?;
-        in_range("max_corrections_n", f64::from(self.max_corrections_n), 1.0, 100.0)
+        in_range(
+            "max_predicted_error_m",
+            self.max_predicted_error_m,
+            1e-6,
+            1.0,
+        )?;
+        in_range(
+            "max_corrections_n",
+            f64::from(self.max_corrections_n),
+            1.0,
+            100.0,
+        )
     }
 }
 

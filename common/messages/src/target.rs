@@ -59,7 +59,9 @@ impl Wire for Target {
     fn validate(&self) -> Result<(), String> {
         finite("pixel_px", &self.pixel_px)?;
         finite("right_pixel_px", &self.right_pixel_px)?;
-        self.covariance_m2.iter().try_for_each(|row| finite("covariance_m2", row))?;
+        self.covariance_m2
+            .iter()
+            .try_for_each(|row| finite("covariance_m2", row))?;
         in_range("plane_rms_mm", self.plane_rms_mm, 0.0, 1e3)?;
         in_range("roughness_mm", self.roughness_mm, 0.0, 1e4)
     }

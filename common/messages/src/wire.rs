@@ -83,7 +83,10 @@ impl std::error::Error for Fault {}
 pub fn finite(field: &str, values: &[f64]) -> Result<(), String> {
     match values.iter().position(|x| !x.is_finite()) {
         None => Ok(()),
-        Some(i) => Err(format!("{field}[{i}]: {} is not a finite number", values[i])),
+        Some(i) => Err(format!(
+            "{field}[{i}]: {} is not a finite number",
+            values[i]
+        )),
     }
 }
 
