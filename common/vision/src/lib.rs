@@ -1,7 +1,24 @@
 //! Images and what is measured in them: interest points, the end-effector's fiducial, and the
 //! surface under a pixel of a stereo pair.
 
+pub mod fiducial;
+pub mod harris;
 pub mod image;
 pub mod ncc;
 pub mod plate;
 pub mod sample;
+pub mod stereo;
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod synthetic;
+
+pub use fiducial::{
+    DetectionRules, NotFound, PlateObservation, PlatePose, PlateSearch, PointFault, PointKind,
+    PointObservation, estimate_plate_pose, find_plate, find_saddle,
+};
+pub use image::{Image8, ImageError, ImageF, encode_png};
+pub use plate::{Disc, LayoutError, PlateLayout, Saddle};
+pub use stereo::{
+    MatchFailure, MatchRules, PreparedImage, StereoMatch, Surface, SurfaceFailure, SurfaceRules,
+    match_point, measure_surface, sparse_points,
+};

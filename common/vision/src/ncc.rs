@@ -193,9 +193,6 @@ impl Template {
 /// A part of an image at full, half, quarter ... resolution, prepared for correlation.
 #[derive(Clone, Debug)]
 pub struct SearchImage {
-    left_px: u32,
-    top_px: u32,
-    level: u32,
     width: usize,
     height: usize,
     stride: usize,
@@ -280,6 +277,17 @@ impl SearchImage {
     #[must_use]
     pub fn height(&self) -> usize {
         self.height
+    }
+
+    /// One row of held values, see [`SearchImage::grey`].
+    pub(crate) fn values(&self, y: usize) -> &[i16] {
+        &self.row(y)[..self.width]
+    }
+
+    /// The grey value (DN) that a held value stands for.
+    #[inline]
+    pub(crate) fn grey(held: i16) -> f32 {
+        (f32::from(held) + OFFSET as f32) * (1.0 / SCALE as f32)
     }
 
     fn row(&self, y: usize) -> &[i16] {

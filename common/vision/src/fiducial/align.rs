@@ -1,0 +1,409 @@
+//! From the predicted pose to an aligned one: correlation of the warped appearance at reduced
+//! resolution, then a least-squares alignment of the whole plate.
+
+use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
+
+use super::model::{self, LocalMap, Part, Picture};
+use super::{NotFound, PlateSearch};
+use crate::image::Image8;
+use crate::ncc::{SearchImage, Template, score_map};
+
+/// A place where the plate may be: the map around the centre of the searched part, and the NCC of
+/// its appearance there.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Candidate {
+    pub map: LocalMap,
+    pub score: f64,
+}
+
+/// Least side of a part's image at the coarse level, px of that level.
+const MIN_COARSE_SIDE: f64 = 12.0;
+/// Least radius of a mark at the coarse level, px of that level.
+const MIN_COARSE_MARK: f64 = 0.9;
+/// Coarsest level: quarter resolution.
+const MAX_LEVEL: u32 = 2;
+/// Variance of the box that makes one pixel of unit side, px^2.
+const BOX_VARIANCE: f64 = 1.0 / 12.0;
+
+/// Smallest half size of the searched part's marks, m.
+fn smallest_mark_m(search: &PlateSearch, part: Part) -> f64 {
+    let discs = search.layout.discs.iter().map(|d| d.radius_m);
+    let saddle = search.layout.saddle.iter().map(|s| s.half_size_m);
+    match part {
+        Part::Plate => discs.chain(saddle).fold(f64::INFINITY, f64::min),
+        Part::Saddle => saddle.fold(f64::INFINITY, f64::min),
+    }
+}
+
+/// Finds the places that look most like the searched part, best first, aligned at full resolution.
+pub(super) fn coarse(
+    image: &Image8,
+    search: &PlateSearch,
+    map: &LocalMap,
+    part: Part,
+) -> Result<Vec<Candidate>, NotFound> {
+    let rules = search.rules;
+    let mark_px = smallest_mark_m(search, part) * map.scales().0;
+    if !(mark_px >= rules.min_mark_radius_px) {
+        return Err(NotFound::TooSmall {
+            found_px: mark_px,
+            needed_px: rules.min_mark_radius_px,
+        });
+    }
+    let (low, high) = model::bounds(search.layout, part, map);
+    let side = (high.x - low.x).min(high.y - low.y);
+    let mut level = 0;
+    while level < MAX_LEVEL
+        && side / f64::from(2u32 << level) >= MIN_COARSE_SIDE
+        && mark_px / f64::from(2u32 << level) >= MIN_COARSE_MARK
+    {
+        level += 1;
+    }
+    let outside = || NotFound::OutsideImage {
+        u_px: map.pixel_px.x,
+        v_px: map.pixel_px.y,
+        search_radius_px: search.search_radius_px,
+    };
+    // the widest hypothesis must fit
+    let room = search.search_radius_px + 0.15 * (high - low).max() + 2.0 * f64::from(1u32 << level);
+    let clamp = |x: f64, size: u32| x.clamp(0.0, f64::from(size)) as u32;
+    let left = clamp((low.x - room).floor(), image.width_px);
+    let top = clamp((low.y - room).floor(), image.height_px);
+    let right = clamp((high.x + room).ceil() + 1.0, image.width_px);
+    let bottom = clamp((high.y + room).ceil() + 1.0, image.height_px);
+    if right <= left || bottom <= top {
+        return Err(outside());
+    }
+    let window = SearchImage::new(image, left, top, right - left, bottom - top, level);
+    let corner = Vector2::new(f64::from(left), f64::from(top));
+
+    let mut found: Vec<Candidate> = Vec::new();
+    let mut placed = false;
+    let mut attempt = |variant: &LocalMap, found: &mut Vec<Candidate>| {
+        if let Some(list) = correlate(search, variant, part, &window, corner, level) {
+            placed = true;
+            found.extend(list);
+        }
+    };
+    attempt(map, &mut found);
+    let best = |found: &[Candidate]| found.iter().map(|c| c.score).fold(-1.0, f64::max);
+    if best(&found) < rules.good_coarse_score {
+        for variant in variants(search, map) {
+            attempt(&variant, &mut found);
+        }
+    }
+    if !placed {
+        return Err(outside());
+    }
+    found.sort_by(|a, b| b.score.total_cmp(&a.score));
+    let score = best(&found);
+    if score < rules.min_coarse_score {
+        return Err(NotFound::LowScore {
+            score,
+            limit: rules.min_coarse_score,
+        });
+    }
+    let mut aligned: Vec<Candidate> = Vec::new();
+    let mut tried: Vec<Vector2<f64>> = Vec::new();
+    for candidate in found.iter().filter(|c| c.score >= rules.min_coarse_score) {
+        if tried.len() >= rules.max_candidates {
+            break;
+        }
+        let near = 0.15 * side;
+        if tried
+            .iter()
+            .any(|p| (p - candidate.map.pixel_px).norm() < near)
+        {
+            continue;
+        }
+        tried.push(candidate.map.pixel_px);
+        if let Some(better) = refine(image, search, candidate, part, level) {
+            aligned.push(better);
+            if better.score >= rules.good_coarse_score {
+                break; // unmistakable
+            }
+        }
+    }
+    aligned.sort_by(|a, b| b.score.total_cmp(&a.score));
+    if aligned.is_empty() {
+        return Err(NotFound::LowScore {
+            score,
+            limit: rules.min_score,
+        });
+    }
+    Ok(aligned)
+}
+
+/// The predicted map turned, scaled and foreshortened as the rules say.
+fn variants(search: &PlateSearch, map: &LocalMap) -> Vec<LocalMap> {
+    let rules = search.rules;
+    let mut all = Vec::new();
+    let mut push = |change: Matrix2<f64>| {
+        all.extend(LocalMap::from_parts(
+            map.centre_m,
+            map.pixel_px,
+            change * map.m,
+            map.g,
+        ));
+    };
+    let turn = |degrees: f64| nalgebra::Rotation2::new(degrees.to_radians()).into_inner();
+    for &angle in &rules.rotations_deg {
+        push(turn(angle));
+    }
+    let angles: Vec<f64> = std::iter::once(0.0)
+        .chain(rules.rotations_deg.iter().copied())
+        .collect();
+    for &scale in &rules.scales {
+        for &angle in &angles {
+            push(turn(angle) * scale);
+        }
+    }
+    // squeeze along the direction in which the plate is already foreshortened
+    let svd = map.m.svd(true, false);
+    if let Some(u) = svd.u {
+        let shortest = usize::from(svd.singular_values[1] < svd.singular_values[0]);
+        let axis: Vector2<f64> = u.column(shortest).into_owned();
+        for &factor in &rules.foreshortenings {
+            push(Matrix2::identity() + (factor - 1.0) * axis * axis.transpose());
+        }
+    }
+    all
+}
+
+/// Correlates one appearance over the window. `None` if it does not fit in.
+fn correlate(
+    search: &PlateSearch,
+    map: &LocalMap,
+    part: Part,
+    window: &SearchImage,
+    corner: Vector2<f64>,
+    level: u32,
+) -> Option<Vec<Candidate>> {
+    let step = f64::from(1u32 << level);
+    let (low, high) = model::bounds(search.layout, part, map);
+    let size = |a: f64, b: f64| ((b - a) / step).ceil() as usize + 1;
+    let (width, height) = (size(low.x, high.x), size(low.y, high.y));
+    if width > window.width() || height > window.height() {
+        return None;
+    }
+    // image position of the template's first pixel when drawn
+    let origin = low;
+    let picture = model::draw(
+        search.layout,
+        part,
+        map,
+        level_sigma(search.rules.blur_sigma_px, level),
+        origin,
+        step,
+        (width, height),
+    )?;
+    let values: Vec<f32> = picture.values.iter().map(|x| -x).collect();
+    let template = Template::new(width, height, &values, Some(&picture.mask)).ok()?;
+    // position i of the window has its first pixel's centre at corner + i step + (step - 1) / 2
+    let offset = (origin - corner) / step - Vector2::repeat((step - 1.0) / (2.0 * step));
+    let radius = search.search_radius_px / step;
+    let range = |x: f64| {
+        let first = (x - radius).floor().max(0.0);
+        let last = (x + radius).ceil();
+        (first as usize, (last - first + 1.0).max(0.0) as usize)
+    };
+    let ((x, columns), (y, rows)) = (range(offset.x), range(offset.y));
+    let scores = score_map(window, &template, x, y, columns, rows)?;
+    let list = scores
+        .peaks(search.rules.max_candidates)
+        .into_iter()
+        .filter_map(|(i, j, score)| {
+            let (du, dv) = scores.refine(i, j);
+            let found = Vector2::new((scores.left + i) as f64 + du, (scores.top + j) as f64 + dv);
+            let pixel_px = map.pixel_px + (found - offset) * step;
+            LocalMap::from_parts(map.centre_m, pixel_px, map.m, map.g).map(|map| Candidate {
+                map,
+                score: f64::from(score),
+            })
+        });
+    Some(list.collect())
+}
+
+/// Blur of an image reduced `level` times, in full-resolution px.
+fn level_sigma(sigma_px: f64, level: u32) -> f64 {
+    let step = f64::from(1u32 << level);
+    // the full-resolution blur already holds one pixel's box
+    (sigma_px * sigma_px + (step * step - 1.0) * BOX_VARIANCE).sqrt()
+}
+
+const MAX_STEPS: usize = 8;
+/// Alignment stops when a step moves the part's corners by less, px of the level.
+const SETTLED_PX: f64 = 0.02;
+
+/// Aligns position, rotation, size and shear level by level; `None` if it runs away.
+fn refine(
+    image: &Image8,
+    search: &PlateSearch,
+    start: &Candidate,
+    part: Part,
+    level: u32,
+) -> Option<Candidate> {
+    let mut map = start.map;
+    let mut score = 0.0;
+    for level in (0..=level).rev() {
+        let step = f64::from(1u32 << level);
+        let sigma = level_sigma(search.rules.blur_sigma_px, level);
+        let steps = if level == 0 { 6 } else { MAX_STEPS };
+        for _ in 0..steps {
+            let (next, moved, ncc) = align_step(image, search, &map, part, level, sigma)?;
+            map = next;
+            score = ncc;
+            if moved < SETTLED_PX * step {
+                break;
+            }
+        }
+    }
+    let away = (map.pixel_px - start.map.pixel_px).norm();
+    let (low, high) = model::bounds(search.layout, part, &start.map);
+    (away <= 0.25 * (high - low).norm()).then_some(Candidate { map, score })
+}
+
+/// One Gauss-Newton step for the six affine parameters, gain and offset. Returns the new map, how
+/// far the farthest corner moved (px), and the NCC *before* the step.
+fn align_step(
+    image: &Image8,
+    search: &PlateSearch,
+    map: &LocalMap,
+    part: Part,
+    level: u32,
+    sigma_px: f64,
+) -> Option<(LocalMap, f64, f64)> {
+    let step = f64::from(1u32 << level);
+    let (low, high) = model::bounds(search.layout, part, map);
+    // grid of reduced pixels that are blocks of the full image, aligned to multiples of step
+    let first = |x: f64, size: u32| (x / step).floor().clamp(0.0, f64::from(size >> level)) as u32;
+    let last =
+        |x: f64, size: u32| ((x / step).ceil() + 1.0).clamp(0.0, f64::from(size >> level)) as u32;
+    let (i0, j0) = (first(low.x, image.width_px), first(low.y, image.height_px));
+    let (i1, j1) = (last(high.x, image.width_px), last(high.y, image.height_px));
+    if i1 <= i0 + 2 || j1 <= j0 + 2 {
+        return None;
+    }
+    let (width, height) = ((i1 - i0) as usize, (j1 - j0) as usize);
+    let middle = (step - 1.0) / 2.0;
+    let origin = Vector2::new(f64::from(i0) * step + middle, f64::from(j0) * step + middle);
+    let picture = model::draw(
+        search.layout,
+        part,
+        map,
+        sigma_px,
+        origin,
+        step,
+        (width, height),
+    )?;
+    let seen = SearchImage::new(
+        image,
+        i0 << level,
+        j0 << level,
+        (i1 - i0) << level,
+        (j1 - j0) << level,
+        level,
+    );
+    let (parameters, ncc) = solve(&picture, &seen, map)?;
+    let change =
+        Matrix2::new(parameters[2], parameters[3], parameters[4], parameters[5]) / NORMALISE_PX;
+    let shift = Vector2::new(parameters[0], parameters[1]);
+    let moved = shift.norm() + change.norm() * 0.5 * (high - low).norm();
+    // a step larger than the marks is not believed
+    let limit = 0.08 * (high - low).norm() + step;
+    let damping = if moved > limit { limit / moved } else { 1.0 };
+    let next = LocalMap::from_parts(
+        map.centre_m,
+        map.pixel_px + shift * damping,
+        (Matrix2::identity() + change * damping) * map.m,
+        map.g,
+    )?;
+    Some((next, moved, ncc))
+}
+
+/// Offsets are divided by this in the normal equations, to keep them well scaled.
+const NORMALISE_PX: f64 = 32.0;
+
+/// Least squares of image = gain * darkness(moved) + offset for the motion (du, dv, and the 2 x 2
+/// change per [`NORMALISE_PX`]); also the NCC of image and picture as they are.
+fn solve(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Option<([f64; 6], f64)> {
+    let mut normal = SMatrix::<f64, 8, 8>::zeros();
+    let mut right = SVector::<f64, 8>::zeros();
+    let (mut n, mut si, mut sii) = (0.0f64, 0.0f64, 0.0f64);
+    for j in 0..picture.height {
+        let mut rows = [0.0f32; 45];
+        let v = ((picture.origin_px.y + j as f64 * picture.step_px - map.pixel_px.y) / NORMALISE_PX)
+            as f32;
+        let line = seen.values(j);
+        for i in 0..picture.width {
+            let k = j * picture.width + i;
+            if !picture.mask[k] {
+                continue;
+            }
+            let u = ((picture.origin_px.x + i as f64 * picture.step_px - map.pixel_px.x)
+                / NORMALISE_PX) as f32;
+            let (gu, gv) = (-picture.du[k], -picture.dv[k]);
+            let t = picture.values[k];
+            let y = SearchImage::grey(line[i]);
+            let a = [gu, gv, gu * u, gu * v, gv * u, gv * v, t, 1.0, y];
+            let mut at = 0;
+            for (p, &ap) in a.iter().enumerate() {
+                for &aq in &a[p..] {
+                    rows[at] += ap * aq;
+                    at += 1;
+                }
+            }
+        }
+        let mut at = 0;
+        for p in 0..9 {
+            for q in p..9 {
+                let x = f64::from(rows[at]);
+                at += 1;
+                match (p < 8, q < 8) {
+                    (true, true) => normal[(p, q)] += x,
+                    (true, false) => right[p] += x,
+                    _ => sii += x,
+                }
+            }
+        }
+    }
+    n += normal[(7, 7)];
+    si += right[7];
+    for p in 0..8 {
+        for q in 0..p {
+            normal[(p, q)] = normal[(q, p)];
+        }
+    }
+    if n < 20.0 {
+        return None;
+    }
+    // gain and offset with the motion at rest
+    let (st, stt, sti) = (normal[(6, 7)], normal[(6, 6)], right[6]);
+    let (vt, vi) = (stt - st * st / n, sii - si * si / n);
+    let cross = sti - st * si / n;
+    if !(vt > 0.0 && vi > 0.0) {
+        return None;
+    }
+    let ncc = -cross / (vt * vi).sqrt(); // dark marks: darkness rises where grey falls
+    let gain = cross / vt;
+    let mut damped = normal;
+    for p in 0..6 {
+        damped[(p, p)] *= 1.0 + 1e-4;
+        damped[(p, p)] += 1e-9;
+    }
+    let solution = damped.cholesky()?.solve(&right);
+    // gain times motion was solved for
+    let mut parameters = [0.0; 6];
+    let gain = if solution[6].abs() > 0.3 * gain.abs() {
+        solution[6]
+    } else {
+        gain
+    };
+    for (p, x) in parameters.iter_mut().zip(solution.iter()) {
+        *p = x / gain;
+    }
+    parameters
+        .iter()
+        .all(|x| x.is_finite())
+        .then_some((parameters, ncc))
+}

@@ -1,0 +1,286 @@
+//! Least-squares matching of one window with the epipolar geometry built in.
+//!
+//! Model: right(W(d)) = alpha left(d) + beta, W(d) = at + base d + along (p0 + p1 du + p2 dv) +
+//! across q. Derivatives come from the left window's gradient, taken once, so that their noise is
+//! independent of the resampled right window and the estimate has no noise-induced bias (inverse
+//! compositional idea of Baker and Matthews, with additive updates).
+
+use nalgebra::{SMatrix, SVector, Vector2};
+
+use super::link::Link;
+use super::{MatchFailure, MatchRules, PreparedImage};
+use crate::ncc::SearchImage;
+
+/// Where a fit starts and what it ends with, relative to a [`Link`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Displacement {
+    /// Along the epipolar direction, px.
+    pub along_px: f64,
+    /// Change of `along_px` per pixel of the left image, in u and v.
+    pub slopes: Vector2<f64>,
+    /// Across the epipolar direction, px.
+    pub across_px: f64,
+}
+
+/// A finished fit.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Refined {
+    pub displacement: Displacement,
+    /// NCC of the fitted windows.
+    pub score: f64,
+    /// Standard deviation of `along_px`, px.
+    pub sigma_px: f64,
+}
+
+const MAX_STEPS: usize = 12;
+/// A fit has settled when a step moves window middle and edges by less, px.
+const SETTLED_PX: f64 = 0.002;
+/// Slopes that change by more than this since the derivatives were taken have them taken anew.
+const RELINEARISE_SLOPE: f64 = 0.03;
+/// Grey noise assumed when the offset across the curve is held, DN.
+const ASSUMED_NOISE_DN: f64 = 2.0;
+/// Least gain between the windows.
+const MIN_GAIN: f64 = 0.2;
+
+/// The left window: values and gradients at whole pixels around a pixel.
+pub(super) struct LeftWindow {
+    half: usize,
+    side: usize,
+    /// Offset of the first window pixel from the exact pixel.
+    first: Vector2<f64>,
+    values: Vec<f32>,
+    gradients: Vec<[f32; 2]>,
+    mean: f32,
+    /// Standard deviation, DN.
+    pub deviation_dn: f64,
+}
+
+impl LeftWindow {
+    /// The window of half side `half` around `pixel`; `None` if it leaves the image.
+    pub fn new(image: &PreparedImage, pixel: &Vector2<f64>, half: usize) -> Option<Self> {
+        let (cu, cv) = (pixel.x.round(), pixel.y.round());
+        let room = half as f64 + 1.0;
+        let fits = |x: f64, size: u32| x >= room && x + room <= f64::from(size) - 1.0;
+        if !(fits(cu, image.width_px) && fits(cv, image.height_px)) {
+            return None;
+        }
+        let side = 2 * half + 1;
+        let (u0, v0) = (cu as usize - half, cv as usize - half);
+        let mut values = Vec::with_capacity(side * side);
+        let mut gradients = Vec::with_capacity(side * side);
+        for v in v0..v0 + side {
+            let row = &image.grey.values(v)[u0..u0 + side];
+            values.extend(row.iter().map(|&x| SearchImage::grey(x)));
+            gradients.extend((u0..u0 + side).map(|u| image.spline.gradient_at_pixel(u, v)));
+        }
+        let n = values.len() as f64;
+        let mean = values.iter().map(|&x| f64::from(x)).sum::<f64>() / n;
+        let variance = values
+            .iter()
+            .map(|&x| (f64::from(x) - mean).powi(2))
+            .sum::<f64>()
+            / n;
+        for x in &mut values {
+            *x -= mean as f32;
+        }
+        Some(Self {
+            half,
+            side,
+            first: Vector2::new(u0 as f64 - pixel.x, v0 as f64 - pixel.y),
+            values,
+            gradients,
+            mean: mean as f32,
+            deviation_dn: variance.sqrt(),
+        })
+    }
+}
+
+type Normal = SMatrix<f64, 6, 6>;
+
+/// Derivative columns of every window pixel and their normal matrix.
+struct Derivatives {
+    slopes: Vector2<f64>,
+    columns: Vec<[f32; 4]>,
+    factor: nalgebra::linalg::Cholesky<f64, nalgebra::Const<6>>,
+}
+
+impl Derivatives {
+    fn new(window: &LeftWindow, link: &Link, slopes: Vector2<f64>, hold: f64) -> Option<Self> {
+        // gradient in the right image = A^-T gradient in the left one
+        let inverse = link.matrix(&slopes).try_inverse()?;
+        let (along, across) = (inverse * link.along, inverse * link.across);
+        let (au, av) = (along.x as f32, along.y as f32);
+        let (bu, bv) = (across.x as f32, across.y as f32);
+        let scale = 1.0 / window.half as f32;
+        let (fu, fv) = (window.first.x as f32 * scale, window.first.y as f32 * scale);
+        let mut columns = Vec::with_capacity(window.values.len());
+        let mut normal = Normal::zeros();
+        for j in 0..window.side {
+            let dv = fv + j as f32 * scale;
+            let mut row = [0.0f32; 21];
+            for i in 0..window.side {
+                let at = j * window.side + i;
+                let [gu, gv] = window.gradients[at];
+                let (e, n) = (au * gu + av * gv, bu * gu + bv * gv);
+                let c = [e, e * (fu + i as f32 * scale), e * dv, n];
+                columns.push(c);
+                let all = [c[0], c[1], c[2], c[3], window.values[at], 1.0];
+                let mut k = 0;
+                for p in 0..6 {
+                    for q in p..6 {
+                        row[k] += all[p] * all[q];
+                        k += 1;
+                    }
+                }
+            }
+            let mut k = 0;
+            for p in 0..6 {
+                for q in p..6 {
+                    normal[(p, q)] += f64::from(row[k]);
+                    k += 1;
+                }
+            }
+        }
+        for p in 0..6 {
+            for q in 0..p {
+                normal[(p, q)] = normal[(q, p)];
+            }
+        }
+        normal[(3, 3)] += hold;
+        // a window without gradient along one slope must not fail, only not move
+        for k in 0..3 {
+            normal[(k, k)] += 1e-3 * ASSUMED_NOISE_DN * ASSUMED_NOISE_DN;
+        }
+        Some(Self {
+            slopes,
+            columns,
+            factor: normal.cholesky()?,
+        })
+    }
+}
+
+/// Fits the displacement from a start.
+pub(super) fn refine(
+    window: &LeftWindow,
+    right: &PreparedImage,
+    link: &Link,
+    start: Displacement,
+    rules: &MatchRules,
+) -> Result<Refined, MatchFailure> {
+    let hold = (ASSUMED_NOISE_DN / rules.epipolar_sigma_px).powi(2);
+    let singular = || MatchFailure::NoTexture {
+        found_dn: window.deviation_dn,
+        needed_dn: rules.min_texture_dn,
+    };
+    let half = window.half as f64;
+    let count = window.values.len();
+    let mut now = start;
+    let mut samples = vec![0.0f32; count];
+    let mut derivatives = Derivatives::new(window, link, now.slopes, hold).ok_or_else(singular)?;
+    let square_left: f64 = window
+        .values
+        .iter()
+        .map(|&x| f64::from(x) * f64::from(x))
+        .sum();
+    for _ in 0..MAX_STEPS {
+        let matrix = link.matrix(&now.slopes);
+        let origin = link.at
+            + matrix * window.first
+            + link.along * now.along_px
+            + link.across * now.across_px;
+        let inside = right.spline.sample_grid(
+            [origin.x, origin.y],
+            [matrix.m11, matrix.m21],
+            [matrix.m12, matrix.m22],
+            window.side,
+            window.side,
+            &mut samples,
+        );
+        if !inside {
+            return Err(MatchFailure::CurveOutsideImage);
+        }
+        let sums = products(window, &derivatives.columns, &samples);
+        let mut right_side = SVector::<f64, 6>::from_column_slice(&sums[..6]);
+        right_side[3] += now.across_px * hold;
+        let x = derivatives.factor.solve(&right_side);
+        let gain = x[4];
+        if !(gain >= MIN_GAIN) {
+            return Err(MatchFailure::LowScore {
+                score: 0.0,
+                limit: rules.min_score,
+            });
+        }
+        let step = Displacement {
+            along_px: -x[0] / gain,
+            slopes: Vector2::new(-x[1], -x[2]) / (gain * half),
+            across_px: -x[3] / gain,
+        };
+        now.along_px += step.along_px.clamp(-1.0, 1.0);
+        now.slopes += step.slopes.map(|s| s.clamp(-0.3, 0.3));
+        now.across_px += step.across_px.clamp(-1.0, 1.0);
+        let moved = (now.along_px - start.along_px).abs();
+        if !(moved <= rules.max_correction_px) {
+            return Err(MatchFailure::Diverged {
+                moved_px: moved,
+                limit_px: rules.max_correction_px,
+            });
+        }
+        if !(now.slopes.amax() <= rules.max_slope) {
+            return Err(MatchFailure::TooSteep {
+                slope: now.slopes.amax(),
+                limit: rules.max_slope,
+            });
+        }
+        let size = step
+            .along_px
+            .abs()
+            .max(step.across_px.abs())
+            .max(half * step.slopes.amax());
+        if size < SETTLED_PX {
+            let n = count as f64;
+            let (sum, square, cross) = (sums[5], sums[6], sums[4]);
+            let variance = square - sum * sum / n;
+            let score = cross / (square_left * variance).sqrt();
+            let residual = (square - x.dot(&right_side)).max(0.0) / (n - 6.0);
+            let inverse = derivatives.factor.inverse();
+            let sigma = (residual.max(0.1) * inverse[(0, 0)]).sqrt() / gain;
+            return Ok(Refined {
+                displacement: now,
+                score,
+                sigma_px: sigma.hypot(rules.sigma_floor_px),
+            });
+        }
+        if (now.slopes - derivatives.slopes).amax() > RELINEARISE_SLOPE {
+            derivatives = Derivatives::new(window, link, now.slopes, hold).ok_or_else(singular)?;
+        }
+    }
+    Err(MatchFailure::Diverged {
+        moved_px: (now.along_px - start.along_px).abs(),
+        limit_px: rules.max_correction_px,
+    })
+}
+
+/// Sums of sample times each column, times left value, of the samples, and of their squares; the
+/// samples are taken relative to the left window's mean.
+fn products(window: &LeftWindow, columns: &[[f32; 4]], samples: &[f32]) -> [f64; 7] {
+    let mut total = [0.0f64; 7];
+    let lines = samples
+        .chunks_exact(window.side)
+        .zip(columns.chunks_exact(window.side));
+    for ((line, columns), left) in lines.zip(window.values.chunks_exact(window.side)) {
+        let mut row = [0.0f32; 7];
+        for ((&sample, column), &l) in line.iter().zip(columns).zip(left) {
+            let y = sample - window.mean;
+            for (r, c) in row.iter_mut().zip(column) {
+                *r += y * c;
+            }
+            row[4] += y * l;
+            row[5] += y;
+            row[6] += y * y;
+        }
+        for (t, r) in total.iter_mut().zip(row) {
+            *t += f64::from(r);
+        }
+    }
+    total
+}
