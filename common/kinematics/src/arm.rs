@@ -106,8 +106,13 @@ pub(crate) struct Link {
     pub offset: f64,
     pub sin_alpha: f64,
     pub cos_alpha: f64,
-    sin_half_alpha: f64,
-    cos_half_alpha: f64,
+}
+
+/// Sine and cosine of half a row's twist.
+#[derive(Clone, Debug, PartialEq)]
+struct HalfTwist {
+    sine: f64,
+    cosine: f64,
 }
 
 /// A serial arm of 4 to 7 revolute joints.
@@ -116,6 +121,7 @@ pub struct Arm {
     rows: Vec<DhRow>,
     limits: Vec<JointLimits>,
     pub(crate) links: [Link; MAX_JOINTS],
+    half_twists: [HalfTwist; MAX_JOINTS],
     pub(crate) family: Result<Family, FamilyMismatch>,
 }
 
@@ -207,30 +213,34 @@ impl Arm {
                 return Err(bad("max_acceleration_rad_s2", acceleration, expected));
             }
         }
+        let zero = DhRow {
+            a_m: 0.0,
+            alpha_rad: 0.0,
+            d_m: 0.0,
+            theta_offset_rad: 0.0,
+        };
         let links = std::array::from_fn(|i| {
-            let zero = DhRow {
-                a_m: 0.0,
-                alpha_rad: 0.0,
-                d_m: 0.0,
-                theta_offset_rad: 0.0,
-            };
             let row = rows.get(i).unwrap_or(&zero);
-            let (s, c) = sin_cos(&[row.alpha_rad, 0.5 * row.alpha_rad], 2);
+            let ([sin_alpha, _], [cos_alpha, _]) = sin_cos(&[row.alpha_rad, 0.0], 1);
             Link {
                 a: row.a_m,
                 d: row.d_m,
                 offset: row.theta_offset_rad,
-                sin_alpha: s[0],
-                cos_alpha: c[0],
-                sin_half_alpha: s[1],
-                cos_half_alpha: c[1],
+                sin_alpha,
+                cos_alpha,
             }
+        });
+        let half_twists = std::array::from_fn(|i| {
+            let half = 0.5 * rows.get(i).unwrap_or(&zero).alpha_rad;
+            let ([sine, _], [cosine, _]) = sin_cos(&[half, 0.0], 1);
+            HalfTwist { sine, cosine }
         });
         let family = Family::of(&rows);
         Ok(Self {
             rows,
             limits,
             links,
+            half_twists,
             family,
         })
     }
@@ -285,23 +295,23 @@ impl Arm {
     #[inline]
     pub fn forward(&self, q: &[f64]) -> Result<Isometry3<f64>, ArmError> {
         let n = self.rows.len();
-        let mut half = self.angles(q)?;
-        for angle in &mut half {
+        let mut halves = self.angles(q)?;
+        for angle in &mut halves {
             *angle *= 0.5;
         }
-        let (sine, cosine) = sin_cos(&half, n);
+        let (sine, cosine) = sin_cos(&halves, n);
         let (mut w, mut i, mut j, mut k) = (1.0, 0.0, 0.0, 0.0);
         let (mut x, mut y, mut z) = (0.0, 0.0, 0.0);
         for joint in (0..n).rev() {
-            let link = &self.links[joint];
+            let (link, half) = (&self.links[joint], &self.half_twists[joint]);
             let (s, c) = (sine[joint], cosine[joint]);
             let (sin, cos) = (2.0 * s * c, 1.0 - 2.0 * s * s);
             let (x1, y1) = (x + link.a, link.cos_alpha * y - link.sin_alpha * z);
             z = link.sin_alpha * y + link.cos_alpha * z + link.d;
             x = cos * x1 - sin * y1;
             y = sin * x1 + cos * y1;
-            let (lw, li) = (c * link.cos_half_alpha, c * link.sin_half_alpha);
-            let (lj, lk) = (s * link.sin_half_alpha, s * link.cos_half_alpha);
+            let (lw, li) = (c * half.cosine, c * half.sine);
+            let (lj, lk) = (s * half.sine, s * half.cosine);
             (w, i, j, k) = (
                 (lw * w - li * i) - (lj * j + lk * k),
                 (lw * i + li * w) + (lj * k - lk * j),
@@ -349,25 +359,25 @@ impl Arm {
     /// As [`Arm::forward`].
     pub fn link_poses(&self, q: &[f64]) -> Result<Vec<Isometry3<f64>>, ArmError> {
         let n = self.rows.len();
-        let mut half = self.angles(q)?;
-        for angle in &mut half {
+        let mut halves = self.angles(q)?;
+        for angle in &mut halves {
             *angle *= 0.5;
         }
-        let (sine, cosine) = sin_cos(&half, n);
+        let (sine, cosine) = sin_cos(&halves, n);
         let mut poses = Vec::with_capacity(n + 1);
         let mut pose = Isometry3::identity();
         poses.push(pose);
         for joint in 0..n {
-            let link = &self.links[joint];
+            let (link, half) = (&self.links[joint], &self.half_twists[joint]);
             let (s, c) = (sine[joint], cosine[joint]);
             let (sin, cos) = (2.0 * s * c, 1.0 - 2.0 * s * s);
             pose *= Isometry3::from_parts(
                 Translation3::new(link.a * cos, link.a * sin, link.d),
                 UnitQuaternion::new_unchecked(Quaternion::new(
-                    c * link.cos_half_alpha,
-                    c * link.sin_half_alpha,
-                    s * link.sin_half_alpha,
-                    s * link.cos_half_alpha,
+                    c * half.cosine,
+                    c * half.sine,
+                    s * half.sine,
+                    s * half.cosine,
                 )),
             );
             poses.push(pose);

@@ -16,12 +16,12 @@
 //!
 //! The twists of the rows are only nearly multiples of pi/2. Each branch is therefore corrected
 //! by Newton steps: residual from the true rows, derivative from the equations above, whose
-//! structure is triangular, so that a step costs little more than the residual.
+//! structure is triangular, so that a step costs little more than the residual. Next to a
+//! singularity the closed form itself is iterated instead, on a goal shifted by the residual.
 
 use super::family::{Family, TurretTool};
-use super::numeric;
 use super::{AxisGoal, Branch, Constraint, Elbow, IkError, Shoulder, Wrist, is_usable};
-use crate::arm::{Arm, PADDED};
+use crate::arm::{Arm, Link, PADDED};
 use crate::tool::Tool;
 use crate::trig::sin_cos;
 use nalgebra::Vector3;
@@ -30,123 +30,78 @@ use std::f64::consts::PI;
 /// Sine of `psi` below which the axis counts as parallel to the bending axis.
 const PARALLEL: f64 = 1e-6;
 /// Sine of the elbow, and cosine at the shoulder, below which two branches count as one.
-const COINCIDENT: f64 = 1e-7;
+const COINCIDENT: f64 = 1e-5;
+/// The same before polishing: below it the true rows are asked.
+const NEARLY_COINCIDENT: f64 = 1e-2;
+/// Distance from the first axis at which joint 0 is free, metres.
+const ON_AXIS_M: f64 = 1e-9;
 /// Residual at which polishing stops, metres and radians.
 const POLISHED: f64 = 4e-15;
+/// Residual at which a step that no longer helps much is not missed, metres and radians.
+const GOOD: f64 = 1e-12;
 /// Residual that a branch must reach to be returned, metres and radians.
-const ACCEPTED: f64 = 1e-11;
+const ACCEPTED: f64 = 1e-9;
 
-/// Where a free plane angle shall be: that of `near`, plus a turn.
+/// What is chosen where the goal leaves it free: the angles of `near`, the plane angle plus a turn.
 #[derive(Clone, Copy)]
 pub(crate) struct Preferred<'a> {
     pub near: &'a [f64],
     pub turn_rad: f64,
 }
 
-/// The least violation seen so far.
-struct Reach {
-    least: Option<(f64, Constraint)>,
-}
+/// A broken edge of reach.
+type Edge = (Constraint, f64);
 
-impl Reach {
-    fn fails(&mut self, constraint: Constraint, by_m: f64) {
-        if self.least.is_none_or(|(least, _)| by_m < least) {
-            self.least = Some((by_m, constraint));
-        }
-    }
-}
-
-/// One branch: joint angles about the z axes, and the linearisation at them.
-struct Posture {
-    theta: [f64; PADDED],
-    c1: f64,
+/// A choice of joint 0.
+#[derive(Clone, Copy)]
+struct Side {
+    theta1: f64,
     s1: f64,
-    /// `w.r`.
+    c1: f64,
+    /// `w.r` and `w.z`.
     forward: f64,
-    /// `u` along `r` and `z`.
-    u: (f64, f64),
+    height: f64,
+    /// How uncertain `forward` is before polishing, metres.
+    blur: f64,
+}
+
+/// A choice of the last joint and the plane angle.
+#[derive(Clone, Copy)]
+struct Hand {
+    psi: f64,
     sin_psi: f64,
     cos_psi: f64,
+    phi: f64,
+    /// `u` along `r` and `z`.
+    u: (f64, f64),
+}
+
+/// The plane arm between shoulder and wrist, but for the side of the elbow.
+#[derive(Clone, Copy)]
+struct Plane {
+    /// The wrist from the shoulder, along `r` and `z`.
+    x: f64,
+    z: f64,
+    /// Direction of the wrist, and angle between it and the upper arm.
+    direction: f64,
+    interior: f64,
+    /// Magnitude of `phi3`, its sine and cosine.
+    bent: f64,
+    sine: f64,
+    cosine: f64,
+}
+
+/// A choice of everything, with what the derivative needs.
+struct Posture {
+    side: Side,
+    hand: Hand,
+    /// Angles about the z axes.
+    theta: [f64; PADDED],
     /// Upper arm and forearm along `r` and `z`.
     upper: (f64, f64),
     fore: (f64, f64),
     /// `a2 a3 sin(phi3)`.
     area: f64,
-}
-
-/// Calls `found` with joint angles, branch and singularity of every posture that meets `goal`.
-pub(crate) fn solve(
-    arm: &Arm,
-    tool: &Tool,
-    goal: &AxisGoal,
-    preferred: Option<Preferred<'_>>,
-    mut found: impl FnMut(&[f64], Branch, bool),
-) -> Result<(), IkError> {
-    let family = arm
-        .family
-        .as_ref()
-        .map_err(|m| IkError::NotThisFamily(m.clone()))?;
-    if !is_usable(tool, goal) {
-        return Err(IkError::NotFinite);
-    }
-    let turret = family.tool(tool).map_err(IkError::NotThisFamily)?;
-    let solver = Solver {
-        arm,
-        tool,
-        goal,
-        family,
-        turret,
-    };
-    let mut reach = Reach { least: None };
-    let mut any = false;
-    solver.run(preferred, &mut reach, &mut |joints, branch, singular| {
-        any = true;
-        found(joints, branch, singular);
-    });
-    match (any, reach.least) {
-        (true, _) => Ok(()),
-        (false, Some((by_m, constraint))) => Err(IkError::OutOfReach { constraint, by_m }),
-        (false, None) => Err(IkError::NotFinite),
-    }
-}
-
-/// The branch of given joint angles.
-pub(crate) fn branch_of(arm: &Arm, tool: &Tool, q: &[f64]) -> Result<Branch, IkError> {
-    let family = arm
-        .family
-        .as_ref()
-        .map_err(|m| IkError::NotThisFamily(m.clone()))?;
-    let turret = family.tool(tool).map_err(IkError::NotThisFamily)?;
-    let theta = arm.angles(q)?;
-    let goal = AxisGoal::at(arm, tool, q)?;
-    let w = goal.point - goal.axis.into_inner() * turret.length;
-    let ([s1, sin_psi, sin_elbow, _], [c1, ..]) = sin_cos(
-        &[
-            theta[0],
-            theta[4] + turret.ahead,
-            family.bend * theta[2],
-            0.0,
-        ],
-        3,
-    );
-    let elbow = sin_elbow * (family.upper * family.fore).signum();
-    Ok(Branch {
-        shoulder: if w.x * c1 + w.y * s1 >= 0.0 {
-            Shoulder::Front
-        } else {
-            Shoulder::Back
-        },
-        wrist: if sin_psi >= 0.0 {
-            Wrist::Positive
-        } else {
-            Wrist::Negative
-        },
-        elbow: if elbow >= 0.0 {
-            Elbow::Positive
-        } else {
-            Elbow::Negative
-        },
-    })
 }
 
 struct Solver<'a> {
@@ -155,213 +110,204 @@ struct Solver<'a> {
     goal: &'a AxisGoal,
     family: &'a Family,
     turret: TurretTool,
+    /// The offsets along `n`: the turret's and the tip's along the last y.
+    normal: f64,
+    /// How far beyond an edge of reach a branch is still tried, metres.
+    margin: f64,
+    preferred: Option<Preferred<'a>>,
 }
 
-impl Solver<'_> {
-    fn run(
-        &self,
-        preferred: Option<Preferred<'_>>,
-        reach: &mut Reach,
-        found: &mut impl FnMut(&[f64], Branch, bool),
-    ) {
-        let f = self.family;
-        let w = self.goal.point - self.goal.axis.into_inner() * self.turret.length;
-        let side = f.sideways;
+impl<'a> Solver<'a> {
+    fn new(
+        arm: &'a Arm,
+        tool: &'a Tool,
+        goal: &'a AxisGoal,
+        preferred: Option<Preferred<'a>>,
+    ) -> Result<Self, IkError> {
+        let family = arm
+            .family
+            .as_ref()
+            .map_err(|m| IkError::NotThisFamily(m.clone()))?;
+        let turret = family.tool(tool).map_err(IkError::NotThisFamily)?;
+        // Rounding, and the rows not being quite of the family, may put a goal on the edge of
+        // reach a hair beyond it. The true rows decide when the branch is polished.
+        let tip = turret.length.abs() + turret.along_y.abs();
+        let margin = 1e-12 + 2.0 * family.skew * (family.length + tip);
+        let normal = family.roll * (family.turret + family.face * turret.along_y);
+        Ok(Self {
+            arm,
+            tool,
+            goal,
+            family,
+            turret,
+            normal,
+            margin,
+            preferred,
+        })
+    }
+
+    /// Joint 0 for the wrist in front or behind. `slack_min` is the least distance from the edge
+    /// of reach that is assumed.
+    fn side(&self, shoulder: Shoulder, w: &Vector3<f64>, slack_min: f64) -> Result<Side, Edge> {
+        let offset = self.family.sideways;
         let square = w.x * w.x + w.y * w.y;
         let rho = square.sqrt();
-        let slack = rho - side.abs();
-        // Rounding may put a goal on the limit a hair beyond it.
-        if slack < -1e-12 {
-            reach.fails(Constraint::ShoulderOffset, -slack);
-            return;
+        let slack = rho - offset.abs();
+        if slack < -self.margin {
+            return Err((Constraint::ShoulderOffset, -slack));
         }
-        let along = (slack.max(0.0) * (rho + side.abs())).sqrt();
-        let is_on_axis = rho < 1e-9;
-        let shoulder_is_singular = is_on_axis || along < COINCIDENT * rho;
-        for (shoulder, forward) in [(Shoulder::Front, along), (Shoulder::Back, -along)] {
-            if shoulder == Shoulder::Back && along < COINCIDENT * rho {
-                continue;
-            }
-            let (s1, c1, theta1) = if is_on_axis {
-                // Above the first axis joint 0 is free: that of `near`, or zero.
-                let theta1 = preferred.map_or(0.0, |p| p.near[0] + f.offsets[0]);
-                let turned = if shoulder == Shoulder::Back {
-                    theta1 + PI
-                } else {
-                    theta1
-                };
-                let (s, c) = sin_cos(&[turned, 0.0], 1);
-                (s[0], c[0], turned)
-            } else {
-                let c1 = (forward * w.x - side * w.y) / square;
-                let s1 = (forward * w.y + side * w.x) / square;
-                (s1, c1, s1.atan2(c1))
-            };
-            self.wrists(
-                Side {
-                    shoulder,
-                    forward,
-                    s1,
-                    c1,
-                    theta1,
-                    height: w.z,
-                },
-                shoulder_is_singular,
-                preferred,
-                reach,
-                found,
-            );
+        let is_back = shoulder == Shoulder::Back;
+        if rho < ON_AXIS_M {
+            let theta1 = self
+                .preferred
+                .map_or(0.0, |p| p.near[0] + self.family.offsets[0]);
+            let theta1 = if is_back { theta1 + PI } else { theta1 };
+            let ([s1, _], [c1, _]) = sin_cos(&[theta1, 0.0], 1);
+            return Ok(Side {
+                theta1,
+                s1,
+                c1,
+                forward: 0.0,
+                height: w.z,
+                blur: 0.0,
+            });
         }
+        let along = (slack.max(slack_min) * (rho + offset.abs())).sqrt();
+        let forward = if is_back { -along } else { along };
+        let c1 = (forward * w.x - offset * w.y) / square;
+        let s1 = (forward * w.y + offset * w.x) / square;
+        let blur = 2.0 * self.margin * rho / along.max(1e-9);
+        Ok(Side {
+            theta1: s1.atan2(c1),
+            s1,
+            c1,
+            forward,
+            height: w.z,
+            blur,
+        })
     }
 
-    fn wrists(
-        &self,
-        side: Side,
-        is_singular: bool,
-        preferred: Option<Preferred<'_>>,
-        reach: &mut Reach,
-        found: &mut impl FnMut(&[f64], Branch, bool),
-    ) {
-        let f = self.family;
-        let a = self.goal.axis.into_inner();
+    /// The last joint and the plane angle with the wrist as it is; [`Hand::flipped`] is the other.
+    fn hand(&self, side: &Side, a: &Vector3<f64>) -> Hand {
         let along_m = a.x * side.s1 - a.y * side.c1;
         let along_r = a.x * side.c1 + a.y * side.s1;
-        let sine = (along_r * along_r + a.z * a.z).sqrt();
-        let cos_psi = f.roll * along_m;
-        // The part of w along n: the turret's offset and the tip's along the last y.
-        let normal = f.roll * (f.turret + f.face * self.turret.along_y);
-        let x0 = side.forward - f.reach;
-        let z0 = side.height - f.height;
-        let psi = sine.atan2(cos_psi);
-        if sine < PARALLEL {
-            let hint = preferred.map(|p| {
-                let sum = (1..4).map(|i| p.near[i] + f.offsets[i]).sum::<f64>();
-                f.bend * sum + p.turn_rad
-            });
-            let Some(phi) = free_plane_angle(f, x0, z0, normal, hint, reach) else {
-                return;
-            };
-            let (s, c) = sin_cos(&[phi, 0.0], 1);
-            let wrist = WristAngles {
-                wrist: Wrist::Positive,
-                psi,
-                sin_psi: 0.0,
-                cos_psi: cos_psi.signum(),
-                phi,
-                u: (c[0], s[0]),
-            };
-            self.elbows(&side, &wrist, (x0, z0, normal), true, reach, found);
-            return;
-        }
-        let phi = a.z.atan2(along_r);
-        for wrist in [Wrist::Positive, Wrist::Negative] {
-            let sign = if wrist == Wrist::Positive { 1.0 } else { -1.0 };
-            let wrist = WristAngles {
-                wrist,
-                psi: sign * psi,
-                sin_psi: sign * sine,
-                cos_psi,
-                phi: if sign > 0.0 { phi } else { phi + PI },
-                u: (sign * along_r / sine, sign * a.z / sine),
-            };
-            self.elbows(&side, &wrist, (x0, z0, normal), is_singular, reach, found);
+        // A little more than nothing, so that the division below is defined.
+        let sine = (along_r * along_r + a.z * a.z).sqrt().max(1e-300);
+        let cosine = self.family.roll * along_m;
+        Hand {
+            psi: sine.atan2(cosine),
+            sin_psi: sine,
+            cos_psi: cosine,
+            phi: a.z.atan2(along_r),
+            u: (along_r / sine, a.z / sine),
         }
     }
 
-    fn elbows(
-        &self,
-        side: &Side,
-        wrist: &WristAngles,
-        (x0, z0, normal): (f64, f64, f64),
-        is_singular: bool,
-        reach: &mut Reach,
-        found: &mut impl FnMut(&[f64], Branch, bool),
-    ) {
+    /// The hand where the axis is parallel to the bending axis and the plane angle is free.
+    fn free_hand(&self, side: &Side, hand: &Hand) -> Result<Hand, Edge> {
+        let hint = self.preferred.map(|p| {
+            let sum = (1..4)
+                .map(|i| p.near[i] + self.family.offsets[i])
+                .sum::<f64>();
+            self.family.bend * sum + p.turn_rad
+        });
+        let phi = free_plane_angle(self.family, self.shoulder(side), self.normal, hint)?;
+        let ([s, _], [c, _]) = sin_cos(&[phi, 0.0], 1);
+        Ok(Hand {
+            sin_psi: 0.0,
+            phi,
+            u: (c, s),
+            ..*hand
+        })
+    }
+
+    /// `w` from the shoulder, along `r` and `z`.
+    fn shoulder(&self, side: &Side) -> (f64, f64) {
+        (
+            side.forward - self.family.reach,
+            side.height - self.family.height,
+        )
+    }
+
+    /// How far beyond the plane arm's edges a branch is still tried, metres: what the rows lack
+    /// turns joint 0, and with it the plane angle, the more the nearer both are to singular.
+    fn plane_margin(&self, side: &Side, hand: &Hand) -> f64 {
+        (self.margin + side.blur) / hand.sin_psi.abs().max(1e-2)
+    }
+
+    /// The plane arm. `slack_min` as in [`Self::side`].
+    fn plane(&self, side: &Side, hand: &Hand, slack_min: f64) -> Result<Plane, Edge> {
+        let margin = self.plane_margin(side, hand);
         let f = self.family;
-        let x = x0 + normal * wrist.u.1;
-        let z = z0 - normal * wrist.u.0;
+        let (x0, z0) = self.shoulder(side);
+        let (x, z) = (x0 + self.normal * hand.u.1, z0 - self.normal * hand.u.0);
         let square = x * x + z * z;
         let distance = square.sqrt();
-        let (sum, difference) = ((f.upper + f.fore).abs(), (f.upper - f.fore).abs());
-        let (longest, shortest) = (sum.max(difference), sum.min(difference));
+        let (longest, shortest) = f.span();
         let (beyond, within) = (longest - distance, distance - shortest);
-        if beyond < -1e-12 {
-            reach.fails(Constraint::ArmExtended, -beyond);
-            return;
+        if beyond < -margin {
+            return Err((Constraint::ArmExtended, -beyond));
         }
-        if within < -1e-12 {
-            reach.fails(Constraint::ArmFolded, -within);
-            return;
+        if within < -margin {
+            return Err((Constraint::ArmFolded, -within));
         }
+        let (beyond, within) = (beyond.max(slack_min), within.max(slack_min));
         let twice = 2.0 * f.upper * f.fore;
-        let cos_elbow = (square - f.upper * f.upper - f.fore * f.fore) / twice;
+        let cosine = (square - f.upper * f.upper - f.fore * f.fore) / twice;
         // Heron's form: exact near the straight and the folded arm.
-        let heron =
-            beyond.max(0.0) * (longest + distance) * within.max(0.0) * (distance + shortest);
-        let sin_elbow = heron.sqrt() / twice.abs();
-        let elbow_is_singular = sin_elbow < COINCIDENT;
-        let direction = z.atan2(x);
-        let interior = (f.fore * sin_elbow).atan2(f.upper + f.fore * cos_elbow);
-        let bent = sin_elbow.atan2(cos_elbow);
-        for elbow in [Elbow::Positive, Elbow::Negative] {
-            // The branch is the sign of a2 a3 sin(phi3), that is of the bend as it is seen.
-            let seen = if elbow == Elbow::Positive { 1.0 } else { -1.0 };
-            if seen < 0.0 && elbow_is_singular {
-                continue;
-            }
-            let sign = seen * twice.signum();
-            let (phi2, phi3) = (direction - sign * interior, sign * bent);
-            let s3 = sign * sin_elbow;
-            let straight = f.upper + f.fore * cos_elbow;
-            let upper = if square > 1e-18 {
-                let c2 = (x * straight + z * f.fore * s3) / square;
-                let s2 = (z * straight - x * f.fore * s3) / square;
-                (f.upper * c2, f.upper * s2)
-            } else {
-                let (s, c) = sin_cos(&[phi2, 0.0], 1);
-                (f.upper * c[0], f.upper * s[0])
-            };
-            let posture = Posture {
-                theta: [
-                    side.theta1,
-                    f.bend * phi2,
-                    f.bend * phi3,
-                    f.bend * (wrist.phi - phi2 - phi3),
-                    wrist.psi - self.turret.ahead,
-                    0.0,
-                    0.0,
-                    0.0,
-                ],
-                c1: side.c1,
-                s1: side.s1,
-                forward: side.forward,
-                u: wrist.u,
-                sin_psi: wrist.sin_psi,
-                cos_psi: wrist.cos_psi,
-                upper,
-                fore: (x - upper.0, z - upper.1),
-                area: 0.5 * twice * s3,
-            };
-            let branch = Branch {
-                shoulder: side.shoulder,
-                wrist: wrist.wrist,
-                elbow,
-            };
-            let is_singular = is_singular || elbow_is_singular;
-            match self.polish(&posture, normal, is_singular) {
-                Ok(joints) => found(&joints, branch, is_singular),
-                Err(by_m) => reach.fails(Constraint::ArmExtended, by_m),
-            }
+        let heron = beyond * (longest + distance) * within * (distance + shortest);
+        let sine = heron.sqrt() / twice.abs();
+        let interior = (f.fore * sine).atan2(f.upper + f.fore * cosine);
+        Ok(Plane {
+            x,
+            z,
+            direction: z.atan2(x),
+            interior,
+            bent: sine.atan2(cosine),
+            sine,
+            cosine,
+        })
+    }
+
+    fn posture(&self, side: &Side, hand: &Hand, plane: &Plane, elbow: Elbow) -> Posture {
+        let f = self.family;
+        let (x, z) = (plane.x, plane.z);
+        // The branch is the sign of a2 a3 sin(phi3), that is of the bend as it is seen.
+        let seen = if elbow == Elbow::Positive { 1.0 } else { -1.0 };
+        let sign = seen * (f.upper * f.fore).signum();
+        let (phi2, phi3) = (plane.direction - sign * plane.interior, sign * plane.bent);
+        let square = x * x + z * z;
+        let straight = f.upper + f.fore * plane.cosine;
+        let across = f.fore * sign * plane.sine;
+        let upper = if square > 1e-18 {
+            let scale = f.upper / square;
+            (
+                (x * straight + z * across) * scale,
+                (z * straight - x * across) * scale,
+            )
+        } else {
+            let ([s, _], [c, _]) = sin_cos(&[phi2, 0.0], 1);
+            (f.upper * c, f.upper * s)
+        };
+        let (theta2, theta3) = (f.bend * phi2, f.bend * phi3);
+        let theta4 = f.bend * hand.phi - theta2 - theta3;
+        let theta5 = hand.psi - self.turret.ahead;
+        Posture {
+            side: *side,
+            hand: *hand,
+            theta: [side.theta1, theta2, theta3, theta4, theta5, 0.0, 0.0, 0.0],
+            upper,
+            fore: (x - upper.0, z - upper.1),
+            area: f.upper * across,
         }
     }
 
-    /// Tool point and axis by the true rows.
+    /// Tool point and axis by the given rows.
     #[inline]
-    fn tool_at(&self, theta: &[f64; PADDED]) -> (Vector3<f64>, Vector3<f64>) {
+    fn tool_by(&self, links: &[Link], theta: &[f64; PADDED]) -> (Vector3<f64>, Vector3<f64>) {
         let (sine, cosine) = sin_cos(theta, 5);
         let (mut p, mut v) = (self.tool.tip_in_link, self.tool.axis_in_link.into_inner());
-        for joint in (0..5).rev() {
-            let link = &self.arm.links[joint];
+        for (joint, link) in links.iter().enumerate().rev() {
             let (s, c) = (sine[joint], cosine[joint]);
             let (x, y) = (p.x + link.a, link.cos_alpha * p.y - link.sin_alpha * p.z);
             let z = link.sin_alpha * p.y + link.cos_alpha * p.z + link.d;
@@ -373,62 +319,52 @@ impl Solver<'_> {
         (p, v)
     }
 
-    /// The joint angles after correction on the true rows; `Err` with the distance that remains.
-    fn polish(&self, p: &Posture, normal: f64, is_singular: bool) -> Result<[f64; 5], f64> {
+    /// What the tool lacks to the goal by the true rows.
+    #[inline]
+    fn residual(&self, theta: &[f64; PADDED]) -> (Vector3<f64>, Vector3<f64>) {
+        let (tip, pointing) = self.tool_by(&self.arm.links[..5], theta);
+        (
+            self.goal.point - tip,
+            self.goal.axis.into_inner() - pointing,
+        )
+    }
+
+    /// The angles about the z axes after correction on the true rows; `Err` with the distance
+    /// that remains.
+    fn polish(&self, p: &Posture, branch: Branch) -> Result<[f64; PADDED], f64> {
         let mut theta = p.theta;
-        let axis = self.goal.axis.into_inner();
         let mut before = f64::INFINITY;
         for _ in 0..6 {
-            let (tip, pointing) = self.tool_at(&theta);
-            let (dp, da) = (self.goal.point - tip, axis - pointing);
+            let (dp, da) = self.residual(&theta);
             let error = dp.amax().max(da.amax());
-            if error <= POLISHED || (error >= 0.25 * before && before < ACCEPTED) {
-                return Ok(self.joints(&theta));
+            if error <= POLISHED || (error >= 0.25 * before && before < GOOD) {
+                return Ok(theta);
             }
             if error >= before {
                 break;
             }
             before = error;
-            self.step(p, normal, &dp, &da, &mut theta);
+            self.step(p, &dp, &da, &mut theta);
         }
-        self.rescue(&theta, is_singular)
+        self.rescue(p, branch)
     }
 
     /// One Newton step along the linearised closed form.
     #[inline]
-    fn step(
-        &self,
-        p: &Posture,
-        normal: f64,
-        dp: &Vector3<f64>,
-        da: &Vector3<f64>,
-        theta: &mut [f64; PADDED],
-    ) {
+    fn step(&self, p: &Posture, dp: &Vector3<f64>, da: &Vector3<f64>, theta: &mut [f64; PADDED]) {
         let f = self.family;
+        let (side, hand) = (&p.side, &p.hand);
+        let (u, c1, s1) = (hand.u, side.c1, side.s1);
         let dw = dp - da * self.turret.length;
-        let turn = if p.forward.abs() > 1e-9 {
-            -(dw.x * p.s1 - dw.y * p.c1) / p.forward
-        } else {
-            0.0
-        };
-        let axis_m = da.x * p.s1 - da.y * p.c1 + p.sin_psi * p.u.0 * turn;
-        let axis_r = da.x * p.c1 + da.y * p.s1 - f.roll * p.cos_psi * turn;
-        let psi = p.cos_psi * (p.u.0 * axis_r + p.u.1 * da.z) - f.roll * p.sin_psi * axis_m;
-        let phi = if p.sin_psi == 0.0 {
-            0.0
-        } else {
-            (p.u.0 * da.z - p.u.1 * axis_r) / p.sin_psi
-        };
-        let x = dw.x * p.c1 + dw.y * p.s1 - f.sideways * turn + normal * p.u.0 * phi;
-        let z = dw.z + normal * p.u.1 * phi;
-        let (phi2, phi23) = if p.area.abs() > 1e-12 {
-            (
-                (p.fore.0 * x + p.fore.1 * z) / p.area,
-                -(p.upper.0 * x + p.upper.1 * z) / p.area,
-            )
-        } else {
-            (0.0, 0.0)
-        };
+        let turn = -(dw.x * s1 - dw.y * c1) / side.forward;
+        let axis_m = da.x * s1 - da.y * c1 + hand.sin_psi * u.0 * turn;
+        let axis_r = da.x * c1 + da.y * s1 - f.roll * hand.cos_psi * turn;
+        let psi = hand.cos_psi * (u.0 * axis_r + u.1 * da.z) - f.roll * hand.sin_psi * axis_m;
+        let phi = (u.0 * da.z - u.1 * axis_r) / hand.sin_psi;
+        let x = dw.x * c1 + dw.y * s1 - f.sideways * turn + self.normal * u.0 * phi;
+        let z = dw.z + self.normal * u.1 * phi;
+        let phi2 = (p.fore.0 * x + p.fore.1 * z) / p.area;
+        let phi23 = -(p.upper.0 * x + p.upper.1 * z) / p.area;
         theta[0] += turn;
         theta[1] += f.bend * phi2;
         theta[2] += f.bend * (phi23 - phi2);
@@ -436,83 +372,247 @@ impl Solver<'_> {
         theta[4] += psi;
     }
 
-    /// Next to a singularity the triangular step fails; damped least squares does not.
+    /// Next to a singularity the linearisation fails, but the closed form does not: it is solved
+    /// again for a goal shifted by the difference of the exact family and the true rows. The shift
+    /// changes by the tiny deviation of the rows times the change of the angles, so this contracts.
     #[cold]
-    fn rescue(&self, theta: &[f64; PADDED], is_singular: bool) -> Result<[f64; 5], f64> {
-        let start = self.joints(theta);
-        let end = numeric::refine(self.arm, self.tool, self.goal, &start);
-        let axis_allowed = if is_singular { PARALLEL } else { 1e-9 };
-        if end.position_error_m <= 1e-9 && end.axis_error_rad <= axis_allowed {
-            let mut joints = [0.0; 5];
-            joints.copy_from_slice(&end.q[..5]);
-            Ok(joints)
+    fn rescue(&self, start: &Posture, branch: Branch) -> Result<[f64; PADDED], f64> {
+        let is_free = start.hand.sin_psi == 0.0;
+        let mut theta = start.theta;
+        let mut best = (f64::INFINITY, f64::INFINITY, theta);
+        for _ in 0..40 {
+            let (tip, pointing) = self.tool_by(&self.arm.links[..5], &theta);
+            let (exact_tip, exact_pointing) = self.tool_by(&self.family.exact, &theta);
+            let axis_error = (self.goal.axis.into_inner() - pointing).amax();
+            let error = (self.goal.point - tip)
+                .amax()
+                .max(if is_free { 0.0 } else { axis_error });
+            if error < best.0 {
+                best = (error, axis_error, theta);
+            }
+            if error <= POLISHED {
+                break;
+            }
+            let point = self.goal.point + (exact_tip - tip);
+            let axis = if is_free {
+                exact_pointing
+            } else {
+                (self.goal.axis.into_inner() + (exact_pointing - pointing)).normalize()
+            };
+            let w = point - axis * self.turret.length;
+            let Ok(side) = self.side(branch.shoulder, &w, 0.0) else {
+                break;
+            };
+            let mut hand = if is_free {
+                start.hand
+            } else {
+                self.hand(&side, &axis)
+            };
+            if !is_free && branch.wrist == Wrist::Negative {
+                hand = hand.flipped();
+            }
+            let Ok(plane) = self.plane(&side, &hand, 0.0) else {
+                break;
+            };
+            theta = self.posture(&side, &hand, &plane, branch.elbow).theta;
+        }
+        let axis_allowed = if is_free { PARALLEL } else { ACCEPTED };
+        if best.0 <= ACCEPTED && best.1 <= axis_allowed {
+            Ok(best.2)
         } else {
-            Err(end.position_error_m)
+            Err(best.0)
         }
     }
 
+    /// Whether front and back coincide, given the polished angle of joint 0.
     #[inline]
-    fn joints(&self, theta: &[f64; PADDED]) -> [f64; 5] {
-        std::array::from_fn(|i| theta[i] - self.family.offsets[i])
+    fn is_on_shoulder_edge(&self, side: &Side, w: &Vector3<f64>, theta1: f64) -> bool {
+        let rho = w.x.hypot(w.y);
+        let (s, c) = theta1.sin_cos();
+        side.forward == 0.0 || (w.x * c + w.y * s).abs() < COINCIDENT * rho
+    }
+
+    fn run(&self, found: &mut impl FnMut(&[f64], Branch, bool)) -> Result<(), IkError> {
+        let axis = self.goal.axis.into_inner();
+        let w = self.goal.point - axis * self.turret.length;
+        let mut least: Option<Edge> = None;
+        let mut fails = |(constraint, by_m): Edge| {
+            if least.is_none_or(|(_, other)| by_m < other) {
+                least = Some((constraint, by_m));
+            }
+        };
+        let mut any = false;
+        for shoulder in [Shoulder::Front, Shoulder::Back] {
+            let side = match self.side(shoulder, &w, self.margin) {
+                Ok(side) => side,
+                Err(edge) => {
+                    fails(edge);
+                    break;
+                }
+            };
+            let on_axis = side.forward == 0.0;
+            let is_near_edge = side.forward.abs() < NEARLY_COINCIDENT * w.xy().norm() || on_axis;
+            let hand = self.hand(&side, &axis);
+            let is_parallel = hand.sin_psi < PARALLEL;
+            for wrist in [Wrist::Positive, Wrist::Negative] {
+                let hand = match (is_parallel, wrist) {
+                    (false, Wrist::Positive) => hand,
+                    (false, Wrist::Negative) => hand.flipped(),
+                    (true, Wrist::Negative) => break,
+                    (true, Wrist::Positive) => match self.free_hand(&side, &hand) {
+                        Ok(hand) => hand,
+                        Err(edge) => {
+                            fails(edge);
+                            break;
+                        }
+                    },
+                };
+                let plane = match self.plane(&side, &hand, self.plane_margin(&side, &hand)) {
+                    Ok(plane) => plane,
+                    Err(edge) => {
+                        fails(edge);
+                        continue;
+                    }
+                };
+                for elbow in [Elbow::Positive, Elbow::Negative] {
+                    let branch = Branch {
+                        shoulder,
+                        wrist,
+                        elbow,
+                    };
+                    let posture = self.posture(&side, &hand, &plane, elbow);
+                    let theta = match self.polish(&posture, branch) {
+                        Ok(theta) => theta,
+                        Err(by_m) => {
+                            fails((posture.nearest_edge(), by_m));
+                            continue;
+                        }
+                    };
+                    let meets_front = is_near_edge && self.is_on_shoulder_edge(&side, &w, theta[0]);
+                    let meets_elbow =
+                        plane.sine < NEARLY_COINCIDENT && theta[2].sin().abs() < COINCIDENT;
+                    any = true;
+                    if !meets_front || on_axis || shoulder == Shoulder::Front {
+                        let joints: [f64; 5] =
+                            std::array::from_fn(|i| theta[i] - self.family.offsets[i]);
+                        found(&joints, branch, meets_front || meets_elbow || is_parallel);
+                    }
+                    if meets_elbow {
+                        break;
+                    }
+                }
+            }
+        }
+        match (any, least) {
+            (true, _) => Ok(()),
+            (false, Some((constraint, by_m))) => Err(IkError::OutOfReach { constraint, by_m }),
+            (false, None) => Err(IkError::NotFinite),
+        }
     }
 }
 
-/// A choice of joint 0.
-struct Side {
-    shoulder: Shoulder,
-    forward: f64,
-    s1: f64,
-    c1: f64,
-    theta1: f64,
-    height: f64,
+impl Hand {
+    /// The same axis with the wrist flipped.
+    fn flipped(&self) -> Self {
+        Self {
+            psi: -self.psi,
+            sin_psi: -self.sin_psi,
+            cos_psi: self.cos_psi,
+            phi: self.phi + PI,
+            u: (-self.u.0, -self.u.1),
+        }
+    }
 }
 
-/// A choice of the last joint and the plane angle.
-struct WristAngles {
-    wrist: Wrist,
-    psi: f64,
-    sin_psi: f64,
-    cos_psi: f64,
-    phi: f64,
-    u: (f64, f64),
+impl Posture {
+    /// The edge of reach to which this posture is closest.
+    fn nearest_edge(&self) -> Constraint {
+        let (upper, fore) = (self.upper, self.fore);
+        if self.side.forward.abs() < 1e-2 {
+            Constraint::ShoulderOffset
+        } else if upper.0 * fore.0 + upper.1 * fore.1 > 0.0 {
+            Constraint::ArmExtended
+        } else {
+            Constraint::ArmFolded
+        }
+    }
+}
+
+/// Calls `found` with joint angles, branch and singularity of every posture that meets `goal`.
+pub(crate) fn solve(
+    arm: &Arm,
+    tool: &Tool,
+    goal: &AxisGoal,
+    preferred: Option<Preferred<'_>>,
+    mut found: impl FnMut(&[f64], Branch, bool),
+) -> Result<(), IkError> {
+    if !is_usable(tool, goal) {
+        return Err(IkError::NotFinite);
+    }
+    Solver::new(arm, tool, goal, preferred)?.run(&mut found)
+}
+
+/// The branch of given joint angles.
+pub(crate) fn branch_of(arm: &Arm, tool: &Tool, q: &[f64]) -> Result<Branch, IkError> {
+    let theta = arm.angles(q)?;
+    let goal = AxisGoal::at(arm, tool, q)?;
+    let solver = Solver::new(arm, tool, &goal, None)?;
+    let (f, turret) = (solver.family, solver.turret);
+    let w = goal.point - goal.axis.into_inner() * turret.length;
+    let ([s1, sin_psi, sin_elbow, _], [c1, ..]) = sin_cos(
+        &[theta[0], theta[4] + turret.ahead, f.bend * theta[2], 0.0],
+        3,
+    );
+    let pick = |value: f64| value >= 0.0;
+    Ok(Branch {
+        shoulder: if pick(w.x * c1 + w.y * s1) {
+            Shoulder::Front
+        } else {
+            Shoulder::Back
+        },
+        wrist: if pick(sin_psi) {
+            Wrist::Positive
+        } else {
+            Wrist::Negative
+        },
+        elbow: if pick(sin_elbow * f.upper * f.fore) {
+            Elbow::Positive
+        } else {
+            Elbow::Negative
+        },
+    })
 }
 
 /// The plane angle where the goal leaves it free. The wrist then lies anywhere on a circle of
 /// radius `|normal|` about `(x0, z0)`, at the distance
 /// `R^2 = R0^2 + normal^2 + 2 normal R0 cos(phi - phi0)` from the shoulder. With a hint: the
-/// nearest angle that the two links reach; without: the one that bends the elbow to a right angle,
-/// or nearest to it. `None`, and the violation noted, when no angle is in reach.
+/// nearest angle that the two links reach; without: the one that bends the elbow to a right
+/// angle, or nearest to it.
 fn free_plane_angle(
     f: &Family,
-    x0: f64,
-    z0: f64,
+    (x0, z0): (f64, f64),
     normal: f64,
     hint: Option<f64>,
-    reach: &mut Reach,
-) -> Option<f64> {
-    let (sum, difference) = ((f.upper + f.fore).abs(), (f.upper - f.fore).abs());
-    let (longest, shortest) = (sum.max(difference), sum.min(difference));
+) -> Result<f64, Edge> {
+    let (longest, shortest) = f.span();
     let centre = x0.hypot(z0);
     if centre - normal.abs() > longest {
-        reach.fails(Constraint::ArmExtended, centre - normal.abs() - longest);
-        return None;
+        return Err((Constraint::ArmExtended, centre - normal.abs() - longest));
     }
     if centre + normal.abs() < shortest {
-        reach.fails(Constraint::ArmFolded, shortest - centre - normal.abs());
-        return None;
+        return Err((Constraint::ArmFolded, shortest - centre - normal.abs()));
     }
     let scale = 2.0 * normal * centre;
     if scale.abs() < 1e-12 {
-        return Some(hint.unwrap_or(0.0));
+        return Ok(hint.unwrap_or(0.0));
     }
     let base = x0.atan2(-z0);
     let cosine = |distance: f64| {
         let square = distance * distance - centre * centre - normal * normal;
         (square / scale).clamp(-1.0, 1.0)
     };
-    let right_angle = f.upper.hypot(f.fore);
-    Some(match hint {
-        None => base + cosine(right_angle).acos(),
+    Ok(match hint {
+        None => base + cosine(f.upper.hypot(f.fore)).acos(),
         Some(hint) => {
             let (one, other) = (cosine(longest), cosine(shortest));
             let wanted = (hint - base).cos();

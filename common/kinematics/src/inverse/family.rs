@@ -1,6 +1,6 @@
 //! The family of arms that has a closed form, recognised from the rows and the tool.
 
-use crate::arm::DhRow;
+use crate::arm::{DhRow, Link};
 use crate::tool::Tool;
 use std::f64::consts::FRAC_PI_2;
 use std::fmt;
@@ -62,6 +62,12 @@ pub(crate) struct Family {
     pub face: f64,
     /// Offsets of the joint angles.
     pub offsets: [f64; 5],
+    /// The rows with the twists that the family has exactly.
+    pub exact: [Link; 5],
+    /// Sum of the twists' deviations from the exact family, radians.
+    pub skew: f64,
+    /// Sum of all lengths of the rows, metres.
+    pub length: f64,
 }
 
 /// A tool of the family: axis square to the last link's y, tip on the axis but for a part along y.
@@ -114,6 +120,13 @@ impl Family {
             }
         }
         let sign = |joint: usize| rows[joint].alpha_rad.signum();
+        let square = [FRAC_PI_2, 0.0, 0.0, FRAC_PI_2, FRAC_PI_2];
+        let skew: f64 = rows
+            .iter()
+            .zip(square)
+            .map(|(r, s)| (r.alpha_rad.abs() - s).abs())
+            .sum();
+        let length: f64 = rows.iter().map(|r| r.a_m.abs() + r.d_m.abs()).sum();
         Ok(Self {
             height: rows[0].d_m,
             reach: rows[0].a_m,
@@ -125,7 +138,26 @@ impl Family {
             roll: -sign(0) * sign(3),
             face: sign(4),
             offsets: std::array::from_fn(|i| rows[i].theta_offset_rad),
+            exact: std::array::from_fn(|i| Link {
+                a: rows[i].a_m,
+                d: rows[i].d_m,
+                offset: rows[i].theta_offset_rad,
+                sin_alpha: if square[i] == 0.0 { 0.0 } else { sign(i) },
+                cos_alpha: if square[i] == 0.0 { 1.0 } else { 0.0 },
+            }),
+            skew,
+            length,
         })
+    }
+
+    /// Longest and shortest distance between shoulder and wrist, metres.
+    #[inline]
+    pub(crate) fn span(&self) -> (f64, f64) {
+        let (sum, difference) = (
+            (self.upper + self.fore).abs(),
+            (self.upper - self.fore).abs(),
+        );
+        (sum.max(difference), sum.min(difference))
     }
 
     /// The tool in the terms of the family.

