@@ -1,0 +1,139 @@
+//! What each field of a scenario means, for `rover run --print`.
+
+/// Path of a field and one line about it.
+const FIELDS: &[(&str, &str)] = &[
+    ("name", "Name in reports."),
+    ("description", "What the scenario shows."),
+    ("robot", "The robot file, relative to this file."),
+    (
+        "seed",
+        "Seed of everything that is drawn by chance: model errors, noise, terrain.",
+    ),
+    ("target", "What to place the instrument on."),
+    ("target.pair", "Camera pair, as named in the robot file."),
+    (
+        "target.pixel_px",
+        "Column and row in the left image, px; (0, 0) is the centre of the first pixel.",
+    ),
+    ("servo", "How the instrument is brought to the standoff."),
+    (
+        "servo.method",
+        "\"kinematic\" (no image of the arm), \"epec\" (last error vector), \"epec_field\" (error field with kinematic prior).",
+    ),
+    (
+        "servo.observation",
+        "\"position\" of one mark, or \"pose\" of the whole plate.",
+    ),
+    (
+        "servo.stations_m",
+        "Distances from the target along the normal at which to look, far to near, m; the last is the standoff.",
+    ),
+    (
+        "servo.tolerance_mm",
+        "At the standoff: correct until the next correction is below this, mm.",
+    ),
+    (
+        "servo.max_corrections_n",
+        "At the standoff: at most so many corrections.",
+    ),
+    (
+        "servo.max_predicted_error_mm",
+        "Refuse to go on when the predicted lateral error (one sigma) exceeds this, mm.",
+    ),
+    ("contact", "How contact is made."),
+    ("contact.speed_mm_s", "Speed along the normal, mm/s."),
+    (
+        "contact.max_overtravel_mm",
+        "Travel beyond the target after which there is no surface, mm.",
+    ),
+    ("contact.max_force_n", "Largest axial force, N."),
+    (
+        "contact.retract",
+        "Whether to go back to the standoff after contact.",
+    ),
+    ("arm", "Where the arm starts and ends."),
+    (
+        "arm.start_posture",
+        "Posture of the robot file in which the arm starts.",
+    ),
+    (
+        "arm.end_posture",
+        "Posture to which the arm goes after a placement with retract; empty: it stays at the standoff.",
+    ),
+    (
+        "limits",
+        "Limits on wall-clock time: a run that exceeds one is ended as a fault.",
+    ),
+    ("limits.start_s", "For simulator and services to appear, s."),
+    (
+        "limits.question_s",
+        "For one question (designation, survey, plan, score), s.",
+    ),
+    (
+        "limits.action_s",
+        "For one action (servo, contact, arm motion), s.",
+    ),
+    ("limits.stop_s", "For an orderly stop, s."),
+];
+
+/// The text with a comment before each field that has one.
+pub(super) fn annotate(text: &str) -> String {
+    let mut section = String::new();
+    let mut out = String::new();
+    for line in text.lines() {
+        let path = if let Some(header) = line.strip_prefix('[') {
+            section = header.trim_matches(['[', ']']).into();
+            Some(section.clone())
+        } else {
+            line.split_once(" = ").map(|(key, _)| {
+                if section.is_empty() {
+                    key.into()
+                } else {
+                    format!("{section}.{key}")
+                }
+            })
+        };
+        let comment = path.and_then(|path| FIELDS.iter().find(|(field, _)| *field == path));
+        if let Some((_, comment)) = comment {
+            out.push_str(&format!("# {comment}\n"));
+        }
+        out.push_str(line);
+        out.push('\n');
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::{embedded, scenario::Scenario};
+
+    #[test]
+    fn every_field_of_the_runner_is_explained_and_every_explanation_has_a_field() {
+        let (name, text) = embedded::find(embedded::SCENARIOS, embedded::DEFAULT_SCENARIO).unwrap();
+        let table = toml::Table::try_from(Scenario::parse(text, name).unwrap()).unwrap();
+        let mut paths = Vec::new();
+        for (key, value) in table {
+            if key == "simulation" {
+                continue;
+            }
+            paths.push(key.clone());
+            if let toml::Value::Table(fields) = value {
+                paths.extend(fields.keys().map(|field| format!("{key}.{field}")));
+            }
+        }
+        for path in &paths {
+            assert!(
+                FIELDS.iter().any(|(field, _)| field == path),
+                "{path} is not explained"
+            );
+        }
+        for (field, _) in FIELDS.iter().filter(|(f, _)| !f.starts_with("simulation")) {
+            assert!(
+                paths.iter().any(|path| path == field),
+                "{field} is explained but is none"
+            );
+        }
+    }
+}
