@@ -251,9 +251,6 @@ impl SearchImage {
             }
         }
         Self {
-            left_px: left,
-            top_px: top,
-            level,
             width: w,
             height: h,
             stride,
