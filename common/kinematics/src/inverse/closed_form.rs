@@ -232,7 +232,9 @@ impl<'a> Solver<'a> {
     /// How far beyond the plane arm's edges a branch is still tried, metres: what the rows lack
     /// turns joint 0, and with it the plane angle, the more the nearer both are to singular.
     fn plane_margin(&self, side: &Side, hand: &Hand) -> f64 {
-        (self.margin + side.blur) / hand.sin_psi.abs().max(1e-2)
+        let turn = self.margin + side.blur / side.forward.abs().max(1e-3);
+        let plane_angle = (turn / hand.sin_psi.abs().max(1e-12)).min(2.0);
+        self.margin + side.blur + self.normal.abs() * plane_angle
     }
 
     /// The plane arm. `slack_min` as in [`Self::side`].

@@ -1,4 +1,6 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)]
+// The flight table gives its twists to six decimals, which is not pi/2.
+#![allow(clippy::approx_constant)]
 
 use super::*;
 use crate::arm::{DhRow, JointLimits};
