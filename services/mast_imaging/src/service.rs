@@ -1,0 +1,89 @@
+//! The imaging service on the network: `imaging/<pair>/capture`, `.../left` and `.../right` for
+//! every camera pair of the robot.
+
+use crate::{SERVICE, attach_models};
+use rover_bus::{BusError, Peer, PictureStream};
+use rover_messages::{
+    Fault,
+    imaging::{CaptureRequest, ImageData, RawPair, StereoFrame},
+    keys,
+};
+use rover_robot::{CameraPairDescription, Robot};
+use rover_service::{Service, ServiceShell};
+use rover_vision::{Image8, encode_png};
+use std::{sync::Arc, time::Duration};
+
+/// Wall-clock limit for one exposure.
+const GRAB_LIMIT: Duration = Duration::from_secs(60);
+
+/// Starts the service on `peer`; it lives as long as the returned value.
+///
+/// # Errors
+/// [`BusError`] when a key cannot be declared or the name is taken.
+pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
+    let shell = ServiceShell::new(peer, &robot, SERVICE).await?;
+    let mut served = Vec::new();
+    for pair in &robot.description().cameras {
+        let desk = Arc::new(Desk {
+            peer: peer.clone(),
+            shell: shell.clone(),
+            left: peer.picture_stream(&keys::imaging_picture(&pair.name, "left")).await?,
+            right: peer.picture_stream(&keys::imaging_picture(&pair.name, "right")).await?,
+            pair: pair.clone(),
+        });
+        let key = keys::imaging_capture(&pair.name);
+        let capture = peer.serve(&key, move |request: CaptureRequest| {
+            let desk = desk.clone();
+            async move { desk.capture(request).await }
+        });
+        served.push(capture.await?);
+    }
+    shell.start(served).await
+}
+
+struct Desk {
+    peer: Peer,
+    shell: ServiceShell,
+    pair: CameraPairDescription,
+    left: PictureStream,
+    right: PictureStream,
+}
+
+impl Desk {
+    async fn capture(&self, request: CaptureRequest) -> Result<StereoFrame, Fault> {
+        let _activity = self.shell.activity("capturing");
+        self.shell.answered(self.captured(request).await, "frames")
+    }
+
+    async fn captured(&self, request: CaptureRequest) -> Result<StereoFrame, Fault> {
+        let key = keys::camera_grab(&self.pair.name);
+        let images: RawPair = self
+            .peer
+            .ask(&key, &request, GRAB_LIMIT)
+            .await
+            .map_err(|e| e.into_fault(SERVICE))?;
+        let frame = attach_models(images, &self.pair)?;
+        show(&self.left, &frame.images.left);
+        show(&self.right, &frame.images.right);
+        Ok(frame)
+    }
+}
+
+/// Publishes an image as a picture, encoded only if somebody looks.
+fn show(stream: &PictureStream, image: &ImageData) {
+    let image = Image8 {
+        width_px: image.width_px,
+        height_px: image.height_px,
+        pixels: image.pixels.clone(),
+    };
+    let published = stream.publish("image/png", move || match encode_png(&image) {
+        Ok(png) => png.into(),
+        Err(error) => {
+            tracing::warn!(%error, "an image could not be encoded");
+            Arc::default()
+        }
+    });
+    if let Err(error) = published {
+        tracing::warn!(%error, "a picture could not be published");
+    }
+}
