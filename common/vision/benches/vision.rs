@@ -1,1 +1,133 @@
-fn main() {}
+//! Speed of the image measurements, one thread, on rendered 640 x 480 images.
+#![allow(clippy::unwrap_used, missing_docs)]
+
+use criterion::{Criterion, criterion_group, criterion_main};
+use nalgebra::{Isometry3, Vector2};
+use rover_vision::ncc::{TemplatePyramid, Window, search};
+use rover_vision::*;
+
+#[allow(dead_code)]
+#[path = "../src/synthetic.rs"]
+mod synthetic;
+
+fn plate_image(layout: &PlateLayout, pose: &Isometry3<f64>, side: usize) -> Image8 {
+    let pair = synthetic::pair();
+    let camera = [&pair.left, &pair.right][side];
+    let rays = synthetic::Rays::new(camera);
+    let mut picture: Vec<f64> = (0..640 * 480)
+        .map(|i| synthetic::texture((i % 640) as f64, (i / 640) as f64, 64.0, 3.0, 18.0, 1))
+        .collect();
+    synthetic::draw(&mut picture, &rays, (0, 0, 640, 480), 4, &|o, d| {
+        let p = synthetic::hit_plane(pose, o, d)?;
+        layout.albedo(p.x, p.y).map(|a| a * 220.0)
+    });
+    let mut rng = synthetic::rng(1);
+    let pixels = synthetic::expose(&picture, 640, (0, 0, 640, 480), 0.6, 1.5, &mut rng);
+    Image8::from_raw(640, 480, pixels).unwrap()
+}
+
+fn rock_image(pose: &Isometry3<f64>, side: usize) -> Image8 {
+    let pair = synthetic::pair();
+    let camera = [&pair.left, &pair.right][side];
+    let rays = synthetic::Rays::new(camera);
+    let mut picture = vec![110.0; 640 * 480];
+    synthetic::draw(&mut picture, &rays, (0, 0, 640, 480), 2, &|o, d| {
+        let p = synthetic::hit_plane(pose, o, d)?;
+        Some(synthetic::texture(p.x, p.y, 0.064, 0.0015, 18.0, 3))
+    });
+    let mut rng = synthetic::rng(2);
+    let pixels = synthetic::expose(&picture, 640, (0, 0, 640, 480), 0.6, 1.5, &mut rng);
+    Image8::from_raw(640, 480, pixels).unwrap()
+}
+
+fn fiducial(c: &mut Criterion) {
+    let pair = synthetic::pair();
+    let layout = PlateLayout::standard(0.08);
+    let rules = DetectionRules::default();
+    let pose = synthetic::facing_pose(&pair.left, Vector2::new(300.0, 230.0), 0.6, 0.5, 1.0, 0.2);
+    let (left, right) = (
+        plate_image(&layout, &pose, 0),
+        plate_image(&layout, &pose, 1),
+    );
+    let off = Isometry3::translation(0.004, 0.003, 0.002);
+    let looking = |camera, radius| PlateSearch {
+        camera,
+        layout: &layout,
+        predicted_camera_frame_from_plate: off * pose,
+        search_radius_px: radius,
+        rules: &rules,
+    };
+    for radius in [10.0, 20.0, 60.0] {
+        let search = looking(&pair.left, radius);
+        c.bench_function(&format!("plate, search radius {radius} px"), |b| {
+            b.iter(|| find_plate(&left, &search).unwrap());
+        });
+    }
+    let search = looking(&pair.left, 16.0);
+    c.bench_function("saddle alone, search radius 16 px", |b| {
+        b.iter(|| find_saddle(&left, &search).unwrap());
+    });
+    let seen = [
+        find_plate(&left, &looking(&pair.left, 20.0)).unwrap(),
+        find_plate(&right, &looking(&pair.right, 20.0)).unwrap(),
+    ];
+    c.bench_function("plate pose from two images", |b| {
+        b.iter(|| estimate_plate_pose(&pair, &layout, &seen[0], &seen[1], &(off * pose)).unwrap());
+    });
+}
+
+fn template(c: &mut Criterion) {
+    let pair = synthetic::pair();
+    let pose = synthetic::facing_pose(&pair.left, Vector2::new(320.0, 240.0), 0.6, 0.3, 1.0, 0.0);
+    let image = rock_image(&pose, 0);
+    let values: Vec<f32> = (0..31 * 31)
+        .map(|i| f32::from(image.get(305 + i % 31, 225 + i / 31).unwrap()))
+        .collect();
+    let template = TemplatePyramid::new(31, 31, &values, None, 3).unwrap();
+    c.bench_function("template 31 x 31, whole image", |b| {
+        b.iter(|| search(&image, &template, Window::whole(&image)).unwrap());
+    });
+    let window = Window {
+        left: 290,
+        top: 205,
+        width: 64,
+        height: 64,
+    };
+    c.bench_function("template 31 x 31, 64 x 64 window", |b| {
+        b.iter(|| search(&image, &template, window).unwrap());
+    });
+}
+
+fn stereo(c: &mut Criterion) {
+    let pair = synthetic::pair();
+    let pixel = Vector2::new(340.0, 240.0);
+    let pose = synthetic::facing_pose(&pair.left, pixel, 0.6, 0.6, 0.3, 0.0);
+    let images = [rock_image(&pose, 0), rock_image(&pose, 1)];
+    c.bench_function("prepare one image", |b| {
+        b.iter(|| PreparedImage::new(&images[0]).unwrap());
+    });
+    let [left, right] = images.map(|i| PreparedImage::new(&i).unwrap());
+    let rules = MatchRules {
+        range_min_m: 0.45,
+        range_max_m: 0.9,
+        ..MatchRules::default()
+    };
+    c.bench_function("match of one point over 54 px", |b| {
+        b.iter(|| match_point(&left, &right, &pair, &pixel, &rules).unwrap());
+    });
+    let surface = SurfaceRules {
+        matching: rules.clone(),
+        ..SurfaceRules::default()
+    };
+    c.bench_function("surface under one pixel", |b| {
+        b.iter(|| measure_surface(&left, &right, &pair, &pixel, &surface).unwrap());
+    });
+    let mut slow = c.benchmark_group("whole image");
+    slow.sample_size(10);
+    slow.bench_function("sparse points, every 8 px", |b| {
+        b.iter(|| sparse_points(&left, &right, &pair, 8, &rules).unwrap());
+    });
+}
+
+criterion_group!(benches, fiducial, template, stereo);
+criterion_main!(benches);

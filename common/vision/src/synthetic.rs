@@ -141,15 +141,19 @@ pub fn hit_plane(
     (t > 0.0).then(|| Vector2::new(o.x + t * d.x, o.y + t * d.y))
 }
 
-/// Blurs (Gaussian), adds Gaussian noise, rounds to 8 bits.
+/// Blurs (Gaussian), adds Gaussian noise, rounds to 8 bits. Outside `region` the picture is only
+/// rounded.
 pub fn expose(
     picture: &[f64],
     width: usize,
+    region: Region,
     blur_px: f64,
     noise_dn: f64,
     rng: &mut ChaCha8Rng,
 ) -> Vec<u8> {
     let height = picture.len() / width;
+    let (u0, v0, w, h) = region;
+    let (u1, v1) = ((u0 + w).min(width), (v0 + h).min(height));
     let radius = (4.0 * blur_px).ceil() as isize;
     let kernel: Vec<f64> = (-radius..=radius)
         .map(|k| (-0.5 * (k as f64 / blur_px).powi(2)).exp())
@@ -157,9 +161,9 @@ pub fn expose(
     let sum: f64 = kernel.iter().sum();
     let clamp = |x: isize, size: usize| x.clamp(0, size as isize - 1) as usize;
     let pass = |source: &[f64], across: bool| {
-        let mut out = vec![0.0; source.len()];
-        for v in 0..height {
-            for u in 0..width {
+        let mut out = source.to_vec();
+        for v in v0..v1 {
+            for u in u0..u1 {
                 let mut total = 0.0;
                 for (k, weight) in kernel.iter().enumerate() {
                     let k = k as isize - radius;
@@ -175,10 +179,15 @@ pub fn expose(
         }
         out
     };
-    let blurred = pass(&pass(picture, true), false);
+    let mut blurred = pass(&pass(picture, true), false);
+    for v in v0..v1 {
+        for x in &mut blurred[v * width + u0..v * width + u1] {
+            *x += noise_dn * normal(rng);
+        }
+    }
     blurred
         .iter()
-        .map(|x| (x + noise_dn * normal(rng)).round().clamp(0.0, 255.0) as u8)
+        .map(|x| x.round().clamp(0.0, 255.0) as u8)
         .collect()
 }
 

@@ -264,25 +264,31 @@ impl MarkModel {
             let z = value / slope / self.sigma;
             let (p, density) = normal().at(z);
             let rate = 2.0 * density / self.sigma;
-            let unit = w / slope;
-            (
-                2.0 * p - 1.0,
-                rate * row[0] * unit,
-                rate * row[1] * unit,
-                -rate * z,
-                slope,
-            )
+            let unit = [row[0] * w / slope, row[1] * w / slope];
+            (2.0 * p - 1.0, rate, unit, -rate * z, slope)
         };
-        let (ex, ex_u, ex_v, ex_s, slope_x) = line(x, i[0]);
-        let (ey, ey_u, ey_v, ey_s, slope_y) = line(y, i[1]);
+        let (ex, rate_x, unit_x, ex_s, slope_x) = line(x, i[0]);
+        let (ey, rate_y, unit_y, ey_s, slope_y) = line(y, i[1]);
         let edge_x = (x.abs() - self.size_m) / slope_x;
         let edge_y = (y.abs() - self.size_m) / slope_y;
+        let (edge_px, outward) = if edge_x >= edge_y {
+            (edge_x, unit_x.map(|c| c * x.signum()))
+        } else {
+            (edge_y, unit_y.map(|c| c * y.signum()))
+        };
+        let inner = 0.5 + 0.5 * ex * ey;
+        let inner_u = 0.5 * (rate_x * unit_x[0] * ey + ex * rate_y * unit_y[0]);
+        let inner_v = 0.5 * (rate_x * unit_x[1] * ey + ex * rate_y * unit_y[1]);
+        // the checker ends at the square's border, blurred like any edge
+        let z = edge_px / self.sigma;
+        let (inside, density) = normal().at(-z);
+        let fade = density / self.sigma;
         Darkness {
-            value: 0.5 + 0.5 * ex * ey,
-            du: 0.5 * (ex_u * ey + ex * ey_u),
-            dv: 0.5 * (ex_v * ey + ex * ey_v),
-            dsigma: 0.5 * (ex_s * ey + ex * ey_s),
-            edge_px: edge_x.max(edge_y),
+            value: inner * inside,
+            du: inner_u * inside - inner * fade * outward[0],
+            dv: inner_v * inside - inner * fade * outward[1],
+            dsigma: 0.5 * (ex_s * ey + ex * ey_s) * inside + inner * fade * z,
+            edge_px,
         }
     }
 }
@@ -402,14 +408,7 @@ pub(super) fn draw(
             let dv = (origin_px.y + j as f64 * step_px - local.pixel_px.y) as f32;
             for i in range(from.x, to.x, width) {
                 let du = (origin_px.x + i as f64 * step_px - local.pixel_px.x) as f32;
-                let mut d = mark.at(du, dv);
-                if mark.kind == MarkKind::Saddle {
-                    // the checker ends at the square's border, blurred like any edge
-                    let (p, _) = normal().at(-d.edge_px / sigma_px as f32);
-                    d.value *= p;
-                    d.du *= p;
-                    d.dv *= p;
-                }
+                let d = mark.at(du, dv);
                 let k = j * width + i;
                 picture.values[k] += d.value;
                 picture.du[k] += d.du;

@@ -67,7 +67,7 @@ impl Default for DetectionRules {
             foreshortenings: vec![0.85, 1.15],
             max_candidates: 4,
             min_score: 0.45,
-            min_saddle_score: 0.85,
+            min_saddle_score: 0.9,
             min_points: 6,
             min_contrast_dn: 15.0,
             max_contrast_change: 0.25,
