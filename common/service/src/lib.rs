@@ -7,6 +7,7 @@
 //! shell.start(vec![served]).await // presence comes last: whoever sees it can ask every key
 //! ```
 
+pub mod frames;
 pub mod motion;
 mod reach;
 

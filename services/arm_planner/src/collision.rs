@@ -183,7 +183,14 @@ impl CollisionModel {
             }
         }
         let mount_centre = robot.mount_centre();
-        Self { robot, margins, shapes, body, pairs, mount_centre }
+        Self {
+            robot,
+            margins,
+            shapes,
+            body,
+            pairs,
+            mount_centre,
+        }
     }
 
     /// The robot.
@@ -204,26 +211,41 @@ impl CollisionModel {
     /// The largest distance that any pair is ever required to keep, m.
     pub(crate) fn largest_margin_m(&self) -> f64 {
         let m = &self.margins;
-        [m.links, m.body, m.terrain, m.instrument].iter().map(|b| b.high_m).fold(0.0, f64::max)
+        [m.links, m.body, m.terrain, m.instrument]
+            .iter()
+            .map(|b| b.high_m)
+            .fold(0.0, f64::max)
     }
 
     /// Where everything is at joint angles `q` (rad).
     pub(crate) fn place(&self, q: &[f64]) -> Result<Placed, ArmError> {
         let rover_from_base = self.robot.rover_from_arm_base.isometry;
-        let rover_from_links: Vec<_> =
-            self.robot.arm.link_poses(q)?.iter().map(|pose| rover_from_base * pose).collect();
+        let rover_from_links: Vec<_> = self
+            .robot
+            .arm
+            .link_poses(q)?
+            .iter()
+            .map(|pose| rover_from_base * pose)
+            .collect();
         let cores = self
             .shapes
             .iter()
             .map(|s| {
                 let pose = &rover_from_links[s.link];
                 let at = |p: Vector3<f64>| (pose * Point3::from(p)).coords;
-                Segment { from: at(s.core.from), to: at(s.core.to) }
+                Segment {
+                    from: at(s.core.from),
+                    to: at(s.core.to),
+                }
             })
             .collect();
         let last = &rover_from_links[rover_from_links.len() - 1];
         let tip = (last * Point3::from(self.robot.tool.tip_in_link)).coords;
-        Ok(Placed { rover_from_links, cores, tip })
+        Ok(Placed {
+            rover_from_links,
+            cores,
+            tip,
+        })
     }
 
     /// Calls `visit` with every pair: links and body always, the terrain where it is nearer than
@@ -238,12 +260,18 @@ impl CollisionModel {
     ) {
         for &pair in &self.pairs {
             let (a, closest, radius_m) = match pair {
-                Pair::Links(a, b) => {
-                    (a, placed.cores[a].closest_to_segment(&placed.cores[b]), self.shapes[b].radius_m)
-                }
+                Pair::Links(a, b) => (
+                    a,
+                    placed.cores[a].closest_to_segment(&placed.cores[b]),
+                    self.shapes[b].radius_m,
+                ),
                 Pair::Body(a, b) => {
                     let body = &self.body[b];
-                    (a, placed.cores[a].closest_to_segment(&body.core), body.radius_m)
+                    (
+                        a,
+                        placed.cores[a].closest_to_segment(&body.core),
+                        body.radius_m,
+                    )
                 }
                 Pair::Terrain(_) => continue,
             };
@@ -268,13 +296,20 @@ impl CollisionModel {
         let last = self.robot.arm.joint_count();
         let (bounds, link, from, point) = match pair {
             // Errors of the rows between the two links move the outer one against the inner.
-            Pair::Links(a, b) => {
-                (m.links, self.shapes[b].link, self.shapes[a].link, closest.on_second)
-            }
+            Pair::Links(a, b) => (
+                m.links,
+                self.shapes[b].link,
+                self.shapes[a].link,
+                closest.on_second,
+            ),
             Pair::Body(a, _) => (m.body, self.shapes[a].link, 0, closest.on_first),
             Pair::Terrain(a) => {
                 let link = self.shapes[a].link;
-                let bounds = if link == last { m.instrument } else { m.terrain };
+                let bounds = if link == last {
+                    m.instrument
+                } else {
+                    m.terrain
+                };
                 (bounds, link, 0, closest.on_first)
             }
         };
@@ -288,7 +323,12 @@ impl CollisionModel {
         } else {
             bounds.high_m
         };
-        Proximity { pair, distance_m, required_m, at: closest.on_first }
+        Proximity {
+            pair,
+            distance_m,
+            required_m,
+            at: closest.on_first,
+        }
     }
 
     /// Standard deviation of the position of `point` (on `link`) along `direction`, seen from
@@ -310,8 +350,14 @@ impl CollisionModel {
         };
         let mut variance = 0.0;
         for row in from + 1..=link {
-            let (before, after) = (&placed.rover_from_links[row - 1], &placed.rover_from_links[row]);
-            let (z, x) = (before.rotation * Vector3::z(), after.rotation * Vector3::x());
+            let (before, after) = (
+                &placed.rover_from_links[row - 1],
+                &placed.rover_from_links[row],
+            );
+            let (z, x) = (
+                before.rotation * Vector3::z(),
+                after.rotation * Vector3::x(),
+            );
             for part in [
                 turned(&z, &before.translation.vector),
                 turned(&x, &after.translation.vector),
@@ -336,7 +382,9 @@ impl CollisionModel {
             Pair::Body(a, _) | Pair::Terrain(a) => (a, 0),
         };
         let levers = &self.shapes[a].levers_m;
-        (from..levers.len()).map(|joint| dq[joint].abs() * levers[joint]).sum()
+        (from..levers.len())
+            .map(|joint| dq[joint].abs() * levers[joint])
+            .sum()
     }
 
     /// How far any point of the arm moves, at most, when the joints move by `dq`, m.
@@ -348,8 +396,15 @@ impl CollisionModel {
 
     /// Distance of a point (rover frame, m) from the arm's surface, m.
     pub(crate) fn distance_to_arm_m(&self, placed: &Placed, point: &Vector3<f64>) -> f64 {
-        let spot = Segment { from: *point, to: *point };
-        let arm = self.shapes.iter().zip(&placed.cores).map(|(s, core)| (core, s.radius_m));
+        let spot = Segment {
+            from: *point,
+            to: *point,
+        };
+        let arm = self
+            .shapes
+            .iter()
+            .zip(&placed.cores)
+            .map(|(s, core)| (core, s.radius_m));
         let body = self.body.iter().map(|s| (&s.core, s.radius_m));
         arm.chain(body)
             .map(|(core, radius_m)| spot.closest_to_segment(core).distance_m - radius_m)
@@ -365,10 +420,17 @@ impl CollisionModel {
         margin_m: f64,
     ) -> Option<(&str, f64)> {
         let last = self.robot.arm.joint_count();
-        let links = self.shapes.iter().zip(&placed.cores).filter(|(s, _)| s.link < last);
+        let links = self
+            .shapes
+            .iter()
+            .zip(&placed.cores)
+            .filter(|(s, _)| s.link < last);
         links
             .map(|(s, core)| {
-                (s.name.as_str(), core.closest_to_segment(sight).distance_m - s.radius_m)
+                (
+                    s.name.as_str(),
+                    core.closest_to_segment(sight).distance_m - s.radius_m,
+                )
             })
             .find(|(_, distance_m)| *distance_m < margin_m)
     }
@@ -379,12 +441,14 @@ impl CollisionModel {
 fn levers(robot: &Robot, shape: &Shape) -> Vec<f64> {
     let rows = robot.arm.rows();
     let mut levers = vec![0.0; shape.link];
-    let Some(own) = shape.link.checked_sub(1) else { return levers };
+    let Some(own) = shape.link.checked_sub(1) else {
+        return levers;
+    };
     let row = &rows[own];
     let joint_from_link = Isometry3::translation(row.a_m, 0.0, row.d_m)
         * UnitQuaternion::from_axis_angle(&Vector3::x_axis(), row.alpha_rad);
-    let ends = [shape.core.from, shape.core.to]
-        .map(|end| (joint_from_link * Point3::from(end)).coords);
+    let ends =
+        [shape.core.from, shape.core.to].map(|end| (joint_from_link * Point3::from(end)).coords);
     levers[own] = ends.iter().map(|p| p.xy().norm()).fold(0.0, f64::max);
     let mut reach = ends.iter().map(|p| p.norm()).fold(0.0, f64::max);
     for joint in (0..own).rev() {

@@ -17,7 +17,10 @@ pub fn attach_models(images: RawPair, pair: &CameraPairDescription) -> Result<St
     if images.pair != pair.name {
         return Err(fault(
             "wrong_pair",
-            format!("the cameras sent the pair `{}`, expected `{}`", images.pair, pair.name),
+            format!(
+                "the cameras sent the pair `{}`, expected `{}`",
+                images.pair, pair.name
+            ),
         ));
     }
     if !images.sim_time_s.is_finite() {
@@ -48,5 +51,8 @@ pub fn attach_models(images: RawPair, pair: &CameraPairDescription) -> Result<St
             .with("expected_height_px", expected.1.into()));
         }
     }
-    Ok(StereoFrame { images, cameras: pair.cameras.clone() })
+    Ok(StereoFrame {
+        images,
+        cameras: pair.cameras.clone(),
+    })
 }

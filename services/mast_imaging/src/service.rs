@@ -27,8 +27,12 @@ pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> 
         let desk = Arc::new(Desk {
             peer: peer.clone(),
             shell: shell.clone(),
-            left: peer.picture_stream(&keys::imaging_picture(&pair.name, "left")).await?,
-            right: peer.picture_stream(&keys::imaging_picture(&pair.name, "right")).await?,
+            left: peer
+                .picture_stream(&keys::imaging_picture(&pair.name, "left"))
+                .await?,
+            right: peer
+                .picture_stream(&keys::imaging_picture(&pair.name, "right"))
+                .await?,
             pair: pair.clone(),
         });
         let key = keys::imaging_capture(&pair.name);

@@ -107,35 +107,44 @@ fn refused(failure: &SurfaceFailure, request: &SelectRequest) -> Fault {
     use SurfaceFailure as F;
     let [u, v] = request.pixel_px;
     let named = |name| {
-        fault(name, format!("pixel ({u}, {v}) of the pair `{}`: {failure}", request.pair))
-            .with("u_px", u)
-            .with("v_px", v)
+        fault(
+            name,
+            format!("pixel ({u}, {v}) of the pair `{}`: {failure}", request.pair),
+        )
+        .with("u_px", u)
+        .with("v_px", v)
     };
     match failure {
-        F::NoTexture { found_dn, needed_dn } => {
-            named("no_texture").with("found_dn", *found_dn).with("needed_dn", *needed_dn)
-        }
-        F::NotUnique { best, second } => {
-            named("not_unique").with("best_score", *best).with("second_score", *second)
-        }
+        F::NoTexture {
+            found_dn,
+            needed_dn,
+        } => named("no_texture")
+            .with("found_dn", *found_dn)
+            .with("needed_dn", *needed_dn),
+        F::NotUnique { best, second } => named("not_unique")
+            .with("best_score", *best)
+            .with("second_score", *second),
         F::Occluded(_) => named("occluded"),
-        F::NothingInRange { min_m, max_m, .. } => {
-            named("no_surface_in_range").with("range_min_m", *min_m).with("range_max_m", *max_m)
-        }
+        F::NothingInRange { min_m, max_m, .. } => named("no_surface_in_range")
+            .with("range_min_m", *min_m)
+            .with("range_max_m", *max_m),
         F::OutsideImage(_) => named("too_close_to_border"),
         F::TooFewPoints { found, needed } => named("too_few_points")
             .with("found_n", *found as f64)
             .with("needed_n", *needed as f64),
-        F::TooRough { rms_mm, rms_limit_mm, roughness_mm, roughness_limit_mm } => {
-            named("too_rough")
-                .with("plane_rms_mm", *rms_mm)
-                .with("plane_rms_limit_mm", *rms_limit_mm)
-                .with("roughness_mm", *roughness_mm)
-                .with("roughness_limit_mm", *roughness_limit_mm)
-        }
-        F::NormalFacingAway { cosine, limit } => {
-            named("normal_facing_away").with("cosine", *cosine).with("limit", *limit)
-        }
+        F::TooRough {
+            rms_mm,
+            rms_limit_mm,
+            roughness_mm,
+            roughness_limit_mm,
+        } => named("too_rough")
+            .with("plane_rms_mm", *rms_mm)
+            .with("plane_rms_limit_mm", *rms_limit_mm)
+            .with("roughness_mm", *roughness_mm)
+            .with("roughness_limit_mm", *roughness_limit_mm),
+        F::NormalFacingAway { cosine, limit } => named("normal_facing_away")
+            .with("cosine", *cosine)
+            .with("limit", *limit),
         F::BadInput(_) => named("bad_frame"),
     }
 }
@@ -169,14 +178,21 @@ pub fn check_reach(robot: &Robot, target: &Target) -> Result<(), Fault> {
 
 fn reached(robot: &Robot, tip: Point<Rover>, axis: Direction<Rover>) -> Result<(), IkError> {
     let base_from_rover = robot.rover_from_arm_base.inverse();
-    let goal = AxisGoal { point: (base_from_rover * tip).coords, axis: (base_from_rover * axis).unit };
+    let goal = AxisGoal {
+        point: (base_from_rover * tip).coords,
+        axis: (base_from_rover * axis).unit,
+    };
     match solve_axis(&robot.arm, &robot.tool, &goal) {
         Ok(solutions) if solutions.iter().any(|s| s.within_limits) => return Ok(()),
         // Reached by no branch within its limits: the solver names the least violation.
         Ok(_) | Err(IkError::NotThisFamily(_)) => {}
         Err(error) => return Err(error),
     }
-    let middle: Vec<f64> =
-        robot.arm.limits().iter().map(|l| 0.5 * (l.lower_rad + l.upper_rad)).collect();
+    let middle: Vec<f64> = robot
+        .arm
+        .limits()
+        .iter()
+        .map(|l| 0.5 * (l.lower_rad + l.upper_rad))
+        .collect();
     closest_solution(&robot.arm, &robot.tool, &goal, &middle).map(|_| ())
 }

@@ -41,10 +41,13 @@ struct Desk {
 impl Desk {
     async fn select(&self, request: SelectRequest) -> Result<Target, Fault> {
         let _activity = self.shell.activity("selecting");
-        let target = self.shell.answered(self.selected(request).await, "targets")?;
+        let target = self
+            .shell
+            .answered(self.selected(request).await, "targets")?;
         if let Err(error) = self.current.publish(target.clone()) {
             let fault = error.into_fault(SERVICE);
-            self.shell.fault(&fault, "target answered but not published");
+            self.shell
+                .fault(&fault, "target answered but not published");
         }
         Ok(target)
     }
