@@ -45,8 +45,8 @@ fn lines(centre: f64, far: f64) -> Vec<f64> {
     let mut half = vec![0.0];
     let (mut x, mut step) = (0.0, 0.01);
     while x < far {
-        if x > 1.0 {
-            step *= 1.09;
+        if x > 0.9 {
+            step *= 1.12;
         }
         x += step;
         half.push(x);
@@ -74,20 +74,20 @@ fn terrain() -> Vec<StaticMesh> {
             surface: Surface::rock(seed as u32),
         });
     };
-    stone(5, 0.86, -0.06, 0.17, 6);
-    stone(6, 0.62, 0.26, 0.06, 5);
-    stone(7, 1.25, 0.30, 0.12, 5);
+    stone(5, 0.86, -0.06, 0.17, 5);
+    stone(6, 0.62, 0.26, 0.06, 4);
+    stone(7, 1.25, 0.30, 0.12, 4);
     let random = |k: u64, c: f64| 0.5 + 0.5 * shapes::noise(&Vector3::new(k as f64, c, 0.0), 77);
     for k in 0..90 {
         let (x, y) = (random(k, 0.0) * 7.0 + 0.2, (random(k, 1.0) - 0.5) * 8.0);
         let radius = 0.012 / (0.07 + random(k, 2.0).powi(2));
         if (x - 0.86).hypot(y + 0.06) > 0.3 + radius {
-            stone(100 + k, x, y, radius, if radius > 0.05 { 4 } else { 3 });
+            stone(100 + k, x, y, radius, if radius > 0.05 { 3 } else { 2 });
         }
     }
     for k in 0..160 {
         let (x, y) = (random(k, 5.0) * 1.6 + 0.3, (random(k, 6.0) - 0.5) * 1.6);
-        stone(1000 + k, x, y, 0.004 + 0.008 * random(k, 7.0), 2);
+        stone(1000 + k, x, y, 0.004 + 0.008 * random(k, 7.0), 1);
     }
     out
 }
@@ -100,7 +100,7 @@ fn along(a: Vector3<f64>, b: Vector3<f64>) -> (Isometry3<f64>, f64) {
 }
 
 fn albedo(x: f64, y: f64) -> Option<f64> {
-    let dark = 0.06;
+    let dark = 0.04;
     for (cx, cy) in [
         (-0.028, -0.028),
         (0.028, -0.028),
@@ -112,16 +112,16 @@ fn albedo(x: f64, y: f64) -> Option<f64> {
         }
     }
     if x.abs() < 0.016 && y.abs() < 0.016 {
-        return Some(if (x > 0.0) == (y > 0.0) { dark } else { 0.82 });
+        return Some(if (x > 0.0) == (y > 0.0) { dark } else { 0.5 });
     }
-    Some(0.82)
+    Some(0.5)
 }
 
 /// The parts of an arm with a plate on its last link, and their poses for a given bend.
 fn arm() -> (Vec<DynamicPart>, Vec<Plate>) {
     let paint = |mesh: Mesh| DynamicPart {
         mesh,
-        surface: Surface::paint(0.55, 3),
+        surface: Surface::paint(0.42, 3),
     };
     let metal = |mesh: Mesh| DynamicPart {
         mesh,
@@ -165,8 +165,8 @@ fn arm() -> (Vec<DynamicPart>, Vec<Plate>) {
         half_width_m: 0.04,
         half_height_m: 0.04,
         albedo: Arc::new(albedo),
-        blank_albedo: 0.82,
-        back_albedo: 0.3,
+        blank_albedo: 0.5,
+        back_albedo: 0.25,
     };
     (parts, vec![plate])
 }
@@ -179,7 +179,7 @@ fn pose(step: f64) -> FrameState {
     let fore = along(elbow, wrist).0;
     let tool = |z: f64| {
         let down = Vector3::new(0.12, 0.0, -1.0).normalize();
-        let face = Vector3::new(0.75, 0.3, 0.35);
+        let face = Vector3::new(0.8, -0.25, -0.3);
         let y = (face - down * face.dot(&down)).normalize();
         let turn =
             Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[y.cross(&down), y, down]));

@@ -16,7 +16,12 @@
 //! the unit of work and of what is kept between frames (`frame`). Kernels are written once for
 //! eight lanes and run as AVX2 or as plain arrays with the same bits (`simd`).
 
+// lanes and axes index several arrays at once
+#![allow(clippy::needless_range_loop)]
+
 mod cast;
+#[cfg(test)]
+mod coverage_tests;
 mod error;
 mod frame;
 mod geometry;

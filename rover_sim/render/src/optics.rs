@@ -164,7 +164,8 @@ impl Optics {
             let (u_px, v_px) = (u as f64, v as f64);
             let (start, direction) = checked(u_px, v_px)?;
             let distance_m = (start - centre).norm();
-            if !(distance_m <= 1e-7) {
+            let one_pupil = distance_m <= 1e-7;
+            if !one_pupil {
                 return Err(RenderError::MovingPupil {
                     u_px,
                     v_px,
@@ -172,7 +173,8 @@ impl Optics {
                 });
             }
             let d = axis_from_camera * direction.into_inner();
-            if !(d.z > 0.174) {
+            let narrow = d.z > 0.174;
+            if !narrow {
                 let angle_deg = d.z.acos().to_degrees();
                 return Err(RenderError::TooWide {
                     u_px,

@@ -90,14 +90,14 @@ impl Texture {
 }
 
 impl Surface {
-    /// Soil with detail from 0.5 m down to 1.5 mm.
+    /// Soil with detail from 0.25 m down to 1.5 mm.
     pub fn ground(seed: u32) -> Self {
         let texture = Texture {
-            coarsest_wavelength_m: 0.5,
+            coarsest_wavelength_m: 0.25,
             finest_wavelength_m: 0.0015,
-            amplitude: 0.26,
+            amplitude: 0.22,
             octave_gain: 1.0,
-            relief: 0.10,
+            relief: 0.17,
             squeeze: [1.0; 3],
             seed,
         };
@@ -114,7 +114,7 @@ impl Surface {
             finest_wavelength_m: 0.0015,
             amplitude: 0.24,
             octave_gain: 1.0,
-            relief: 0.14,
+            relief: 0.2,
             squeeze: [1.0, 1.0, 1.6],
             seed,
         };
@@ -390,7 +390,8 @@ fn check_mesh(body: &str, mesh: &Mesh, surface: &Surface) -> Result<(), SceneErr
                 vertex,
             });
         }
-        if !((n.norm() - 1.0).abs() < 1e-3) {
+        let is_unit = (n.norm() - 1.0).abs() < 1e-3;
+        if !is_unit {
             return Err(SceneError::Normal {
                 body: body.to_owned(),
                 vertex,

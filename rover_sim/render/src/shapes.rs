@@ -2,6 +2,10 @@
 //!
 //! Built with arithmetic alone (sines by series), so that a shape is the same on every machine.
 
+mod stone;
+
+pub use stone::{fractal_noise, noise, rock};
+
 use crate::scene::Mesh;
 use nalgebra::{Isometry3, Point3, Vector3};
 use std::collections::BTreeMap;
@@ -182,99 +186,6 @@ pub fn icosphere(subdivisions: u32) -> Mesh {
     }
 }
 
-/// A number in -1..1 from a lattice point.
-fn lattice(x: i64, y: i64, z: i64, seed: u64) -> f64 {
-    let h = crate::sensor::mix(
-        seed ^ (x as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15)
-            ^ (y as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f)
-            ^ (z as u64).wrapping_mul(0x1656_67b1_9e37_79f9),
-    );
-    (h >> 11) as f64 / (1_u64 << 52) as f64 - 1.0
-}
-
-/// Smooth noise in space: values in -1..1, unit wavelength. The same everywhere and always for the
-/// same `seed`; made for the shapes of terrain and stones.
-pub fn noise(p: &Vector3<f64>, seed: u64) -> f64 {
-    let base = p.map(f64::floor);
-    let f = p - base;
-    let s = f.map(|t| t * t * t * (t * (t * 6.0 - 15.0) + 10.0));
-    let at = |i: i64, j: i64, k: i64| {
-        lattice(
-            base.x as i64 + i,
-            base.y as i64 + j,
-            base.z as i64 + k,
-            seed,
-        )
-    };
-    let mix = |a: f64, b: f64, t: f64| a + (b - a) * t;
-    let row = |j, k| mix(at(0, j, k), at(1, j, k), s.x);
-    mix(
-        mix(row(0, 0), row(1, 0), s.y),
-        mix(row(0, 1), row(1, 1), s.y),
-        s.z,
-    )
-}
-
-/// Noise summed over `octaves`, each of half the wavelength and `gain` times the amplitude of the
-/// one before; `p` in units of the longest wavelength.
-pub fn fractal_noise(p: &Vector3<f64>, seed: u64, octaves: u32, gain: f64) -> f64 {
-    let (mut sum, mut amplitude, mut q) = (0.0, 1.0, *p);
-    for octave in 0..octaves {
-        sum += amplitude * noise(&q, seed.wrapping_add(u64::from(octave)));
-        amplitude *= gain;
-        q = q * 2.0 + Vector3::new(0.37, 0.71, 0.13);
-    }
-    sum
-}
-
-/// A stone centred on the origin, of mean radius `radius_m`: an icosphere cut by random planes
-/// (facets) and displaced by noise. `roughness` is the relative depth of both, 0 for a sphere, 0.3
-/// for an ordinary stone.
-pub fn rock(seed: u64, radius_m: f64, subdivisions: u32, roughness: f64) -> Mesh {
-    let mut mesh = icosphere(subdivisions);
-    let unit = |k: u64| {
-        let value = |c: i64| lattice(k as i64, c, 7, seed);
-        Vector3::new(value(0), value(1), value(2))
-            .try_normalize(1e-6)
-            .unwrap_or_else(Vector3::z)
-    };
-    // cutting planes: direction and distance from the centre in radii
-    let cuts: Vec<(Vector3<f64>, f64)> = (0..14)
-        .map(|k| {
-            (
-                unit(k),
-                1.0 - roughness * (0.5 + 0.45 * lattice(k as i64, 3, 9, seed)),
-            )
-        })
-        .collect();
-    let stretch = Vector3::new(
-        1.0 + 0.6 * roughness * lattice(1, 5, 5, seed),
-        1.0 + 0.6 * roughness * lattice(2, 5, 5, seed),
-        1.0 - roughness * (0.6 + 0.3 * lattice(3, 5, 5, seed)),
-    );
-    for p in &mut mesh.positions {
-        let direction = *p;
-        let mut reach: f64 = 1.0;
-        for (n, distance) in &cuts {
-            let along = n.dot(&direction);
-            if along > 0.1 {
-                // a soft minimum rounds the edges between facets
-                let limit = distance / along;
-                let blunt = 0.04;
-                let d = reach - limit;
-                let h = (0.5 + 0.5 * d / blunt).clamp(0.0, 1.0);
-                reach = reach * (1.0 - h) + limit * h - blunt * h * (1.0 - h);
-            }
-        }
-        let wide = noise(&(direction * 1.3), seed ^ 0xa5);
-        let fine = fractal_noise(&(direction * 4.0), seed ^ 0x5a, 5, 0.5);
-        reach *= 1.0 + roughness * (0.25 * wide + 0.11 * fine);
-        *p = direction.component_mul(&stretch) * (radius_m * reach);
-    }
-    mesh.smooth();
-    mesh
-}
-
 /// A body of revolution about z: `profile` lists `(radius_m, z_m)` with the outside on the right
 /// of the path (from bottom to top for a solid). Corners sharper than 35 deg become hard edges.
 pub fn lathe(profile: &[[f64; 2]], segments: usize) -> Mesh {
@@ -362,7 +273,7 @@ pub fn capsule(radius_m: f64, length_m: f64, segments: usize) -> Mesh {
         for i in 0..=rings {
             let (s, c) = sin_cos_turns(0.25 * i as f64 / rings as f64 + turn);
             // from the lowest point outwards, then from the side to the top
-            let (r, h) = if turn == 0.0 { (s, -c) } else { (s, -c) };
+            let (r, h) = (s, -c);
             let r = if r.abs() < 1e-12 { 0.0 } else { r };
             profile.push([r * radius_m, z + h * radius_m]);
         }
@@ -420,4 +331,103 @@ pub fn cuboid(half_extents_m: &Vector3<f64>) -> Mesh {
         mesh.triangles.push([n, n + 1, n + 2]);
     }
     mesh
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::expect_used)]
+    use super::*;
+
+    /// Volume by the divergence theorem: positive only if triangles face outwards.
+    fn volume(mesh: &Mesh) -> f64 {
+        let corner = |i: u32| mesh.positions[i as usize];
+        mesh.triangles
+            .iter()
+            .map(|t| corner(t[0]).dot(&corner(t[1]).cross(&corner(t[2]))) / 6.0)
+            .sum()
+    }
+
+    fn check(name: &str, mesh: &Mesh, expected: f64, tolerance: f64) {
+        let v = volume(mesh);
+        assert!(
+            (v / expected - 1.0).abs() < tolerance,
+            "{name}: volume {v}, expected {expected}"
+        );
+        // closed: the area vectors sum to zero
+        let mut sum = Vector3::zeros();
+        for t in &mesh.triangles {
+            let [a, b, c] = t.map(|i| mesh.positions[i as usize]);
+            let area = (b - a).cross(&(c - a));
+            sum += area;
+            for &i in t {
+                let along = mesh.normals[i as usize].dot(&area);
+                assert!(
+                    area.norm() < 1e-15 || along > 0.3 * area.norm(),
+                    "{name}: normal"
+                );
+            }
+        }
+        assert!(sum.norm() < 1e-12, "{name} is open: {sum}");
+        assert!(
+            mesh.normals.iter().all(|n| (n.norm() - 1.0).abs() < 1e-9),
+            "{name}: lengths"
+        );
+    }
+
+    #[test]
+    fn shapes_are_closed_and_have_their_volume() {
+        let pi = std::f64::consts::PI;
+        check("sphere", &icosphere(4), 4.0 / 3.0 * pi, 0.01);
+        check("cylinder", &cylinder(0.1, 0.5, 96), pi * 0.01 * 0.5, 0.01);
+        check("cone", &cone(0.1, 0.0, 0.3, 96), pi * 0.01 * 0.1, 0.01);
+        check(
+            "stump",
+            &cone(0.1, 0.05, 0.3, 96),
+            pi * 0.1 * (0.01 + 0.005 + 0.0025),
+            0.01,
+        );
+        let round = pi * 0.01 * 0.5 + 4.0 / 3.0 * pi * 0.001;
+        check("capsule", &capsule(0.1, 0.5, 96), round, 0.01);
+        check(
+            "box",
+            &cuboid(&Vector3::new(0.1, 0.2, 0.3)),
+            8.0 * 0.006,
+            0.01,
+        );
+    }
+
+    #[test]
+    fn stones_are_closed_and_about_as_large_as_asked() {
+        for seed in 0..20 {
+            let stone = rock(seed, 0.1, 4, 0.3);
+            let v = volume(&stone) / (4.0 / 3.0 * std::f64::consts::PI * 0.001);
+            assert!((0.2..1.3).contains(&v), "seed {seed}: {v} of a sphere");
+            assert!(
+                stone
+                    .positions
+                    .iter()
+                    .all(|p| (0.03..0.15).contains(&p.norm()))
+            );
+        }
+    }
+
+    #[test]
+    fn own_sines_agree_with_the_library() {
+        for i in -400..400 {
+            let turns = f64::from(i) / 171.0;
+            let (s, c) = sin_cos_turns(turns);
+            let (es, ec) = (turns * std::f64::consts::TAU).sin_cos();
+            assert!((s - es).abs() < 1e-10 && (c - ec).abs() < 1e-10, "{turns}");
+        }
+    }
+
+    #[test]
+    fn a_height_field_passes_through_its_function() {
+        let lines: Vec<f64> = (0..10).map(|i| f64::from(i) * 0.1).collect();
+        let mesh = heightfield_mesh(&lines, &lines, |x, y| 0.2 * x - 0.1 * y);
+        assert_eq!((mesh.positions.len(), mesh.triangles.len()), (100, 162));
+        for n in &mesh.normals {
+            assert!((n - Vector3::new(-0.2, 0.1, 1.0).normalize()).norm() < 1e-9);
+        }
+    }
 }

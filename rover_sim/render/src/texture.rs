@@ -153,3 +153,58 @@ fn value_noise<S: Simd>(q: V3<S>, seed: u32) -> (S::F, V3<S>) {
         [dx * rate[0], dy * rate[1], (f - n) * rate[2]],
     )
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::expect_used)]
+    use super::*;
+    use crate::simd::Portable;
+
+    fn noise(p: [f32; 3], seed: u32) -> (f32, [f32; 3]) {
+        let (value, gradient) = value_noise::<Portable>(splat3::<Portable>(p), seed);
+        let first = |x| {
+            let mut lanes = [0.0; 8];
+            Portable::store(x, &mut lanes);
+            lanes[0]
+        };
+        (first(value), gradient.map(first))
+    }
+
+    #[test]
+    fn the_gradient_of_the_noise_is_its_derivative() {
+        for i in 0..300 {
+            let t = i as f32 * 0.37 - 40.0;
+            let p = [t, 1.7 * t + 0.3, 5.0 - 0.9 * t];
+            let (_, gradient) = noise(p, 7);
+            for k in 0..3 {
+                let h = 2e-3;
+                let (mut a, mut b) = (p, p);
+                a[k] -= h;
+                b[k] += h;
+                let slope = (noise(b, 7).0 - noise(a, 7).0) / (b[k] - a[k]);
+                assert!(
+                    (slope - gradient[k]).abs() < 0.03,
+                    "{slope} {}",
+                    gradient[k]
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn noise_is_centred_and_differs_from_seed_to_seed() {
+        let at = |i: usize, seed| {
+            noise(
+                [i as f32 * 0.71, i as f32 * -0.39, (i % 17) as f32 * 1.3],
+                seed,
+            )
+            .0
+        };
+        let n = 20_000;
+        let mean = (0..n).map(|i| f64::from(at(i, 1))).sum::<f64>() / n as f64;
+        let both = (0..n).map(|i| f64::from(at(i, 1) * at(i, 2))).sum::<f64>() / n as f64;
+        let square = (0..n).map(|i| f64::from(at(i, 1)).powi(2)).sum::<f64>() / n as f64;
+        assert!(mean.abs() < 0.02 && both.abs() < 0.01, "{mean} {both}");
+        assert!((0.05..0.25).contains(&square), "{square}");
+    }
+}
