@@ -294,15 +294,25 @@ impl Arm {
     /// [`ArmError`] when `q` has the wrong length or a value that is not finite.
     #[inline]
     pub fn forward(&self, q: &[f64]) -> Result<Isometry3<f64>, ArmError> {
-        let n = self.rows.len();
+        match q.len() {
+            4 => self.forward_of::<4>(q),
+            5 => self.forward_of::<5>(q),
+            6 => self.forward_of::<6>(q),
+            _ => self.forward_of::<7>(q),
+        }
+    }
+
+    /// [`Self::forward`] for `N` joints, so that the compiler unrolls it.
+    #[inline(always)]
+    fn forward_of<const N: usize>(&self, q: &[f64]) -> Result<Isometry3<f64>, ArmError> {
         let mut halves = self.angles(q)?;
         for angle in &mut halves {
             *angle *= 0.5;
         }
-        let (sine, cosine) = sin_cos(&halves, n);
+        let (sine, cosine) = sin_cos(&halves, N);
         let (mut w, mut i, mut j, mut k) = (1.0, 0.0, 0.0, 0.0);
         let (mut x, mut y, mut z) = (0.0, 0.0, 0.0);
-        for joint in (0..n).rev() {
+        for joint in (0..N).rev() {
             let (link, half) = (&self.links[joint], &self.half_twists[joint]);
             let (s, c) = (sine[joint], cosine[joint]);
             let (sin, cos) = (2.0 * s * c, 1.0 - 2.0 * s * s);

@@ -14,33 +14,25 @@
 //! gives joint 0 twice; `a.m` then gives `psi` twice and with it `u` and `phi`; what remains is a
 //! plane arm of two links with its elbow to either side.
 //!
-//! The twists of the rows are only nearly multiples of pi/2. Each branch is therefore corrected
-//! by Newton steps: residual from the true rows, derivative from the equations above, whose
-//! structure is triangular, so that a step costs little more than the residual. Next to a
-//! singularity the closed form itself is iterated instead, on a goal shifted by the residual.
+//! The twists of the rows are only nearly multiples of pi/2, so every branch is then corrected on
+//! the true rows: see [`super::polish`].
 
 use super::family::{Family, TurretTool};
 use super::{AxisGoal, Branch, Constraint, Elbow, IkError, Shoulder, Wrist, is_usable};
-use crate::arm::{Arm, Link, PADDED};
+use crate::arm::{Arm, Link};
 use crate::tool::Tool;
-use crate::trig::sin_cos;
+use crate::trig::{atan2, sin_cos};
 use nalgebra::Vector3;
 use std::f64::consts::PI;
 
 /// Sine of `psi` below which the axis counts as parallel to the bending axis.
-const PARALLEL: f64 = 1e-6;
+pub(super) const PARALLEL: f64 = 1e-6;
 /// Sine of the elbow, and cosine at the shoulder, below which two branches count as one.
 const COINCIDENT: f64 = 1e-5;
 /// The same before polishing: below it the true rows are asked.
 const NEARLY_COINCIDENT: f64 = 1e-2;
 /// Distance from the first axis at which joint 0 is free, metres.
 const ON_AXIS_M: f64 = 1e-9;
-/// Residual at which polishing stops, metres and radians.
-const POLISHED: f64 = 4e-15;
-/// Residual at which a step that no longer helps much is not missed, metres and radians.
-const GOOD: f64 = 1e-12;
-/// Residual that a branch must reach to be returned, metres and radians.
-const ACCEPTED: f64 = 1e-9;
 
 /// What is chosen where the goal leaves it free: the angles of `near`, the plane angle plus a turn.
 #[derive(Clone, Copy)]
@@ -50,71 +42,83 @@ pub(crate) struct Preferred<'a> {
 }
 
 /// A broken edge of reach.
-type Edge = (Constraint, f64);
+pub(super) type Edge = (Constraint, f64);
 
 /// A choice of joint 0.
 #[derive(Clone, Copy)]
-struct Side {
-    theta1: f64,
-    s1: f64,
-    c1: f64,
+pub(super) struct Side {
+    pub theta1: f64,
+    pub s1: f64,
+    pub c1: f64,
     /// `w.r` and `w.z`.
-    forward: f64,
-    height: f64,
+    pub forward: f64,
+    pub height: f64,
     /// How uncertain `forward` is before polishing, metres.
-    blur: f64,
+    pub blur: f64,
+    /// Whether it was moved off the edge of reach.
+    pub is_moved: bool,
 }
 
 /// A choice of the last joint and the plane angle.
 #[derive(Clone, Copy)]
-struct Hand {
-    psi: f64,
-    sin_psi: f64,
-    cos_psi: f64,
-    phi: f64,
+pub(super) struct Hand {
+    pub psi: f64,
+    pub sin_psi: f64,
+    pub cos_psi: f64,
+    pub phi: f64,
     /// `u` along `r` and `z`.
-    u: (f64, f64),
+    pub u: (f64, f64),
 }
 
 /// The plane arm between shoulder and wrist, but for the side of the elbow.
 #[derive(Clone, Copy)]
-struct Plane {
+pub(super) struct Plane {
     /// The wrist from the shoulder, along `r` and `z`.
-    x: f64,
-    z: f64,
+    pub x: f64,
+    pub z: f64,
     /// Direction of the wrist, and angle between it and the upper arm.
-    direction: f64,
-    interior: f64,
+    pub direction: f64,
+    pub interior: f64,
     /// Magnitude of `phi3`, its sine and cosine.
-    bent: f64,
-    sine: f64,
-    cosine: f64,
+    pub bent: f64,
+    pub sine: f64,
+    pub cosine: f64,
+    /// Whether it was moved off the edge of reach.
+    pub is_moved: bool,
 }
 
 /// A choice of everything, with what the derivative needs.
-struct Posture {
-    side: Side,
-    hand: Hand,
-    /// Angles about the z axes.
-    theta: [f64; PADDED],
+pub(super) struct Posture {
+    pub side: Side,
+    pub hand: Hand,
+    /// Angles about the z axes, their sines and cosines.
+    pub theta: [f64; 5],
+    pub sine: [f64; 5],
+    pub cosine: [f64; 5],
     /// Upper arm and forearm along `r` and `z`.
-    upper: (f64, f64),
-    fore: (f64, f64),
+    pub upper: (f64, f64),
+    pub fore: (f64, f64),
     /// `a2 a3 sin(phi3)`.
-    area: f64,
+    pub area: f64,
+    /// Whether the derivative says nothing: the plane angle is free, or the posture was moved off
+    /// an edge of reach, so that its sines and cosines do not fit together.
+    pub is_irregular: bool,
 }
 
-struct Solver<'a> {
-    arm: &'a Arm,
-    tool: &'a Tool,
-    goal: &'a AxisGoal,
-    family: &'a Family,
-    turret: TurretTool,
+pub(super) struct Solver<'a> {
+    pub links: &'a [Link; 5],
+    pub tool: &'a Tool,
+    pub point: Vector3<f64>,
+    /// The goal's axis and the tool's in its link, of unit length to rounding.
+    pub axis: Vector3<f64>,
+    pub axis_in_link: Vector3<f64>,
+    pub family: &'a Family,
+    pub turret: TurretTool,
     /// The offsets along `n`: the turret's and the tip's along the last y.
-    normal: f64,
+    pub normal: f64,
     /// How far beyond an edge of reach a branch is still tried, metres.
-    margin: f64,
-    preferred: Option<Preferred<'a>>,
+    pub margin: f64,
+    pub preferred: Option<Preferred<'a>>,
 }
 
 impl<'a> Solver<'a> {
@@ -134,10 +138,13 @@ impl<'a> Solver<'a> {
         let tip = turret.length.abs() + turret.along_y.abs();
         let margin = 1e-12 + 2.0 * family.skew * (family.length + tip);
         let normal = family.roll * (family.turret + family.face * turret.along_y);
+        let links = arm.links.first_chunk().ok_or(IkError::NotFinite)?;
         Ok(Self {
-            arm,
+            links,
             tool,
-            goal,
+            point: goal.point,
+            axis: goal.axis.normalize(),
+            axis_in_link: tool.axis_in_link.normalize(),
             family,
             turret,
             normal,
@@ -148,7 +155,7 @@ impl<'a> Solver<'a> {
 
     /// Joint 0 for the wrist in front or behind. `slack_min` is the least distance from the edge
     /// of reach that is assumed.
-    fn side(&self, shoulder: Shoulder, w: &Vector3<f64>, slack_min: f64) -> Result<Side, Edge> {
+    pub fn side(&self, shoulder: Shoulder, w: &Vector3<f64>, slack_min: f64) -> Result<Side, Edge> {
         let offset = self.family.sideways;
         let square = w.x * w.x + w.y * w.y;
         let rho = square.sqrt();
@@ -170,6 +177,7 @@ impl<'a> Solver<'a> {
                 forward: 0.0,
                 height: w.z,
                 blur: 0.0,
+                is_moved: false,
             });
         }
         let along = (slack.max(slack_min) * (rho + offset.abs())).sqrt();
@@ -178,27 +186,28 @@ impl<'a> Solver<'a> {
         let s1 = (forward * w.y + offset * w.x) / square;
         let blur = 2.0 * self.margin * rho / along.max(1e-9);
         Ok(Side {
-            theta1: s1.atan2(c1),
+            theta1: atan2(s1, c1),
             s1,
             c1,
             forward,
             height: w.z,
             blur,
+            is_moved: slack < slack_min,
         })
     }
 
     /// The last joint and the plane angle with the wrist as it is; [`Hand::flipped`] is the other.
-    fn hand(&self, side: &Side, a: &Vector3<f64>) -> Hand {
+    pub fn hand(&self, side: &Side, a: &Vector3<f64>) -> Hand {
         let along_m = a.x * side.s1 - a.y * side.c1;
         let along_r = a.x * side.c1 + a.y * side.s1;
         // A little more than nothing, so that the division below is defined.
         let sine = (along_r * along_r + a.z * a.z).sqrt().max(1e-300);
         let cosine = self.family.roll * along_m;
         Hand {
-            psi: sine.atan2(cosine),
+            psi: atan2(sine, cosine),
             sin_psi: sine,
             cos_psi: cosine,
-            phi: a.z.atan2(along_r),
+            phi: atan2(a.z, along_r),
             u: (along_r / sine, a.z / sine),
         }
     }
@@ -238,7 +247,7 @@ impl<'a> Solver<'a> {
     }
 
     /// The plane arm. `slack_min` as in [`Self::side`].
-    fn plane(&self, side: &Side, hand: &Hand, slack_min: f64) -> Result<Plane, Edge> {
+    pub fn plane(&self, side: &Side, hand: &Hand, slack_min: f64) -> Result<Plane, Edge> {
         let margin = self.plane_margin(side, hand);
         let f = self.family;
         let (x0, z0) = self.shoulder(side);
@@ -253,25 +262,27 @@ impl<'a> Solver<'a> {
         if within < -margin {
             return Err((Constraint::ArmFolded, -within));
         }
+        let is_moved = beyond.min(within) < slack_min;
         let (beyond, within) = (beyond.max(slack_min), within.max(slack_min));
         let twice = 2.0 * f.upper * f.fore;
         let cosine = (square - f.upper * f.upper - f.fore * f.fore) / twice;
         // Heron's form: exact near the straight and the folded arm.
         let heron = beyond * (longest + distance) * within * (distance + shortest);
         let sine = heron.sqrt() / twice.abs();
-        let interior = (f.fore * sine).atan2(f.upper + f.fore * cosine);
+        let interior = atan2(f.fore * sine, f.upper + f.fore * cosine);
         Ok(Plane {
             x,
             z,
-            direction: z.atan2(x),
+            direction: atan2(z, x),
             interior,
-            bent: sine.atan2(cosine),
+            bent: atan2(sine, cosine),
             sine,
             cosine,
+            is_moved,
         })
     }
 
-    fn posture(&self, side: &Side, hand: &Hand, plane: &Plane, elbow: Elbow) -> Posture {
+    pub fn posture(&self, side: &Side, hand: &Hand, plane: &Plane, elbow: Elbow) -> Posture {
         let f = self.family;
         let (x, z) = (plane.x, plane.z);
         // The branch is the sign of a2 a3 sin(phi3), that is of the bend as it is seen.
@@ -291,138 +302,35 @@ impl<'a> Solver<'a> {
             let ([s, _], [c, _]) = sin_cos(&[phi2, 0.0], 1);
             (f.upper * c, f.upper * s)
         };
+        let fore = (x - upper.0, z - upper.1);
         let (theta2, theta3) = (f.bend * phi2, f.bend * phi3);
         let theta4 = f.bend * hand.phi - theta2 - theta3;
         let theta5 = hand.psi - self.turret.ahead;
+        // Sines and cosines follow without any angle; phi4 = phi - (phi2 + phi3).
+        let (ahead_sine, ahead_cosine) = self.turret.ahead_sin_cos;
+        let (u, bend) = (hand.u, f.bend);
         Posture {
             side: *side,
             hand: *hand,
-            theta: [side.theta1, theta2, theta3, theta4, theta5, 0.0, 0.0, 0.0],
+            theta: [side.theta1, theta2, theta3, theta4, theta5],
+            sine: [
+                side.s1,
+                bend * upper.1 / f.upper,
+                bend * sign * plane.sine,
+                bend * (u.1 * fore.0 - u.0 * fore.1) / f.fore,
+                hand.sin_psi * ahead_cosine - hand.cos_psi * ahead_sine,
+            ],
+            cosine: [
+                side.c1,
+                upper.0 / f.upper,
+                plane.cosine,
+                (u.0 * fore.0 + u.1 * fore.1) / f.fore,
+                hand.cos_psi * ahead_cosine + hand.sin_psi * ahead_sine,
+            ],
             upper,
-            fore: (x - upper.0, z - upper.1),
+            fore,
             area: f.upper * across,
-        }
-    }
-
-    /// Tool point and axis by the given rows.
-    #[inline]
-    fn tool_by(&self, links: &[Link], theta: &[f64; PADDED]) -> (Vector3<f64>, Vector3<f64>) {
-        let (sine, cosine) = sin_cos(theta, 5);
-        let (mut p, mut v) = (self.tool.tip_in_link, self.tool.axis_in_link.into_inner());
-        for (joint, link) in links.iter().enumerate().rev() {
-            let (s, c) = (sine[joint], cosine[joint]);
-            let (x, y) = (p.x + link.a, link.cos_alpha * p.y - link.sin_alpha * p.z);
-            let z = link.sin_alpha * p.y + link.cos_alpha * p.z + link.d;
-            p = Vector3::new(c * x - s * y, s * x + c * y, z);
-            let y = link.cos_alpha * v.y - link.sin_alpha * v.z;
-            let z = link.sin_alpha * v.y + link.cos_alpha * v.z;
-            v = Vector3::new(c * v.x - s * y, s * v.x + c * y, z);
-        }
-        (p, v)
-    }
-
-    /// What the tool lacks to the goal by the true rows.
-    #[inline]
-    fn residual(&self, theta: &[f64; PADDED]) -> (Vector3<f64>, Vector3<f64>) {
-        let (tip, pointing) = self.tool_by(&self.arm.links[..5], theta);
-        (
-            self.goal.point - tip,
-            self.goal.axis.into_inner() - pointing,
-        )
-    }
-
-    /// The angles about the z axes after correction on the true rows; `Err` with the distance
-    /// that remains.
-    fn polish(&self, p: &Posture, branch: Branch) -> Result<[f64; PADDED], f64> {
-        let mut theta = p.theta;
-        let mut before = f64::INFINITY;
-        for _ in 0..6 {
-            let (dp, da) = self.residual(&theta);
-            let error = dp.amax().max(da.amax());
-            if error <= POLISHED || (error >= 0.25 * before && before < GOOD) {
-                return Ok(theta);
-            }
-            if error >= before {
-                break;
-            }
-            before = error;
-            self.step(p, &dp, &da, &mut theta);
-        }
-        self.rescue(p, branch)
-    }
-
-    /// One Newton step along the linearised closed form.
-    #[inline]
-    fn step(&self, p: &Posture, dp: &Vector3<f64>, da: &Vector3<f64>, theta: &mut [f64; PADDED]) {
-        let f = self.family;
-        let (side, hand) = (&p.side, &p.hand);
-        let (u, c1, s1) = (hand.u, side.c1, side.s1);
-        let dw = dp - da * self.turret.length;
-        let turn = -(dw.x * s1 - dw.y * c1) / side.forward;
-        let axis_m = da.x * s1 - da.y * c1 + hand.sin_psi * u.0 * turn;
-        let axis_r = da.x * c1 + da.y * s1 - f.roll * hand.cos_psi * turn;
-        let psi = hand.cos_psi * (u.0 * axis_r + u.1 * da.z) - f.roll * hand.sin_psi * axis_m;
-        let phi = (u.0 * da.z - u.1 * axis_r) / hand.sin_psi;
-        let x = dw.x * c1 + dw.y * s1 - f.sideways * turn + self.normal * u.0 * phi;
-        let z = dw.z + self.normal * u.1 * phi;
-        let phi2 = (p.fore.0 * x + p.fore.1 * z) / p.area;
-        let phi23 = -(p.upper.0 * x + p.upper.1 * z) / p.area;
-        theta[0] += turn;
-        theta[1] += f.bend * phi2;
-        theta[2] += f.bend * (phi23 - phi2);
-        theta[3] += f.bend * (phi - phi23);
-        theta[4] += psi;
-    }
-
-    /// Next to a singularity the linearisation fails, but the closed form does not: it is solved
-    /// again for a goal shifted by the difference of the exact family and the true rows. The shift
-    /// changes by the tiny deviation of the rows times the change of the angles, so this contracts.
-    #[cold]
-    fn rescue(&self, start: &Posture, branch: Branch) -> Result<[f64; PADDED], f64> {
-        let is_free = start.hand.sin_psi == 0.0;
-        let mut theta = start.theta;
-        let mut best = (f64::INFINITY, f64::INFINITY, theta);
-        for _ in 0..40 {
-            let (tip, pointing) = self.tool_by(&self.arm.links[..5], &theta);
-            let (exact_tip, exact_pointing) = self.tool_by(&self.family.exact, &theta);
-            let axis_error = (self.goal.axis.into_inner() - pointing).amax();
-            let error = (self.goal.point - tip)
-                .amax()
-                .max(if is_free { 0.0 } else { axis_error });
-            if error < best.0 {
-                best = (error, axis_error, theta);
-            }
-            if error <= POLISHED {
-                break;
-            }
-            let point = self.goal.point + (exact_tip - tip);
-            let axis = if is_free {
-                exact_pointing
-            } else {
-                (self.goal.axis.into_inner() + (exact_pointing - pointing)).normalize()
-            };
-            let w = point - axis * self.turret.length;
-            let Ok(side) = self.side(branch.shoulder, &w, 0.0) else {
-                break;
-            };
-            let mut hand = if is_free {
-                start.hand
-            } else {
-                self.hand(&side, &axis)
-            };
-            if !is_free && branch.wrist == Wrist::Negative {
-                hand = hand.flipped();
-            }
-            let Ok(plane) = self.plane(&side, &hand, 0.0) else {
-                break;
-            };
-            theta = self.posture(&side, &hand, &plane, branch.elbow).theta;
-        }
-        let axis_allowed = if is_free { PARALLEL } else { ACCEPTED };
-        if best.0 <= ACCEPTED && best.1 <= axis_allowed {
-            Ok(best.2)
-        } else {
-            Err(best.0)
+            is_irregular: side.is_moved || plane.is_moved || hand.sin_psi == 0.0,
         }
     }
 
@@ -435,8 +343,7 @@ impl<'a> Solver<'a> {
     }
 
     fn run(&self, found: &mut impl FnMut(&[f64], Branch, bool)) -> Result<(), IkError> {
-        let axis = self.goal.axis.into_inner();
-        let w = self.goal.point - axis * self.turret.length;
+        let w = self.point - self.axis * self.turret.length;
         let mut least: Option<Edge> = None;
         let mut fails = |(constraint, by_m): Edge| {
             if least.is_none_or(|(_, other)| by_m < other) {
@@ -454,7 +361,7 @@ impl<'a> Solver<'a> {
             };
             let on_axis = side.forward == 0.0;
             let is_near_edge = side.forward.abs() < NEARLY_COINCIDENT * w.xy().norm() || on_axis;
-            let hand = self.hand(&side, &axis);
+            let hand = self.hand(&side, &self.axis);
             let is_parallel = hand.sin_psi < PARALLEL;
             for wrist in [Wrist::Positive, Wrist::Negative] {
                 let hand = match (is_parallel, wrist) {
@@ -515,7 +422,7 @@ impl<'a> Solver<'a> {
 
 impl Hand {
     /// The same axis with the wrist flipped.
-    fn flipped(&self) -> Self {
+    pub fn flipped(&self) -> Self {
         Self {
             psi: -self.psi,
             sin_psi: -self.sin_psi,
@@ -608,7 +515,7 @@ fn free_plane_angle(
     if scale.abs() < 1e-12 {
         return Ok(hint.unwrap_or(0.0));
     }
-    let base = x0.atan2(-z0);
+    let base = atan2(x0, -z0);
     let cosine = |distance: f64| {
         let square = distance * distance - centre * centre - normal * normal;
         (square / scale).clamp(-1.0, 1.0)

@@ -2,6 +2,7 @@
 
 use crate::arm::{DhRow, Link};
 use crate::tool::Tool;
+use crate::trig::atan2;
 use std::f64::consts::FRAC_PI_2;
 use std::fmt;
 
@@ -79,6 +80,8 @@ pub(crate) struct TurretTool {
     pub along_y: f64,
     /// Angle by which the axis is ahead of the last joint.
     pub ahead: f64,
+    /// Its sine and cosine.
+    pub ahead_sin_cos: (f64, f64),
 }
 
 impl Family {
@@ -162,7 +165,7 @@ impl Family {
 
     /// The tool in the terms of the family.
     pub(crate) fn tool(&self, tool: &Tool) -> Result<TurretTool, FamilyMismatch> {
-        let (axis, tip) = (tool.axis_in_link.into_inner(), tool.tip_in_link);
+        let (axis, tip) = (tool.axis_in_link.normalize(), tool.tip_in_link);
         if axis.y.abs() > TOOL_TOLERANCE {
             return Err(FamilyMismatch {
                 parameter: "y of the tool's axis",
@@ -183,7 +186,8 @@ impl Family {
         Ok(TurretTool {
             length: tip.x * axis.x + tip.z * axis.z,
             along_y: tip.y,
-            ahead: axis.x.atan2(self.face * axis.z),
+            ahead: atan2(axis.x, self.face * axis.z),
+            ahead_sin_cos: (axis.x, self.face * axis.z),
         })
     }
 }

@@ -9,13 +9,14 @@
 mod closed_form;
 pub(crate) mod family;
 mod numeric;
+mod polish;
 
 use crate::arm::{Arm, ArmError, LIMIT_TOLERANCE_RAD, MAX_JOINTS};
 use crate::tool::Tool;
 pub use family::FamilyMismatch;
 use nalgebra::{Unit, Vector3};
 pub use numeric::{NumericOptions, solve_numeric};
-use std::f64::consts::TAU;
+use std::f64::consts::{PI, TAU};
 use std::fmt;
 
 /// Where the tool point shall be and where the tool shall point, arm base frame.
@@ -268,7 +269,12 @@ fn is_usable(tool: &Tool, goal: &AxisGoal) -> bool {
 /// `angle` shifted by whole turns to where it suits the limits best: within them and nearest to
 /// `preferred` if some shift is, otherwise the shift that exceeds them least.
 fn into_limits(angle: f64, lower: f64, upper: f64, preferred: f64) -> f64 {
-    let near = angle + TAU * ((preferred - angle) / TAU).round();
+    // Seldom is there a turn to make, and rounding costs more than a comparison.
+    let near = if (preferred - angle).abs() <= PI {
+        angle
+    } else {
+        angle + TAU * ((preferred - angle) / TAU).round()
+    };
     let (low, high) = (lower - LIMIT_TOLERANCE_RAD, upper + LIMIT_TOLERANCE_RAD);
     if near >= low && near <= high {
         return near;
