@@ -6,7 +6,7 @@ use crate::cast::Caster;
 use crate::geometry::Geometry;
 use crate::optics::{Optics, SAMPLE_U, SAMPLE_V, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH};
 use crate::scene::Mesh;
-use crate::shadow::SunTree;
+use crate::shadow::{SunBox, SunTree};
 use crate::shapes;
 use crate::simd::{Level, Portable};
 use crate::view::View;
@@ -104,7 +104,8 @@ fn a_surface_that_fills_the_view_leaves_no_sample_open() {
         let optics = optics(&camera(eye, Vector3::new(0.3, 0.1, 0.0), 300.0));
         let ground = geometry(&[bumpy_ground(cells, 4.0)]);
         let pose = axis_from_world(&optics);
-        let view = View::new(&optics, &ground, |_| Some(pose));
+        let mut view = View::default();
+        view.see(&optics, &ground, |_| Some(pose));
         let mut open = 0;
         each_sample(&optics, &view, |_, _, _, seen, _| {
             open += usize::from(seen == NOTHING)
@@ -123,7 +124,8 @@ fn a_surface_from_outside_is_closed_up_to_its_silhouette() {
     let shape = geometry(&[ball]);
     let caster = Caster::new(&shape, &Geometry::default());
     let pose = axis_from_world(&optics);
-    let view = View::new(&optics, &shape, |_| Some(pose));
+    let mut view = View::default();
+    view.see(&optics, &shape, |_| Some(pose));
     let (mut wrong, mut checked) = (0, 0);
     each_sample(&optics, &view, |u, v, s, seen, inverse| {
         let at = |margin: f64| {
@@ -174,7 +176,8 @@ fn sample_depths_are_those_of_the_exact_surface() {
     let shape = geometry(&meshes);
     let caster = Caster::new(&shape, &Geometry::default());
     let pose = axis_from_world(&optics);
-    let view = View::new(&optics, &shape, |_| Some(pose));
+    let mut view = View::default();
+    view.see(&optics, &shape, |_| Some(pose));
     let mut errors = Vec::new();
     each_sample(&optics, &view, |u, v, s, seen, inverse| {
         if (u + 3 * v + s) % 7 != 0 {
@@ -214,7 +217,8 @@ fn a_bar_that_passes_beside_and_behind_the_camera_is_drawn() {
     let shape = geometry(&[slab]);
     let caster = Caster::new(&shape, &Geometry::default());
     let pose = axis_from_world(&optics);
-    let view = View::new(&optics, &shape, |_| Some(pose));
+    let mut view = View::default();
+    view.see(&optics, &shape, |_| Some(pose));
     let (mut seen_by_cast, mut missed) = (0, 0);
     each_sample(&optics, &view, |u, v, s, seen, _| {
         if s == 5 {
@@ -241,7 +245,8 @@ fn portable_and_detected_kernels_see_the_same() {
     ));
     let shape = geometry(&[bumpy_ground(150, 4.0), shapes::rock(4, 0.2, 4, 0.3)]);
     let pose = axis_from_world(&optics);
-    let view = View::new(&optics, &shape, |_| Some(pose));
+    let mut view = View::default();
+    view.see(&optics, &shape, |_| Some(pose));
     let (mut a, mut b) = (Samples::new(), Samples::new());
     for (index, tile) in optics.tiles.iter().enumerate() {
         a.clear();
@@ -278,6 +283,10 @@ fn shadows_are_those_of_exact_ray_casts() {
     let sun_from_world =
         Isometry3::from_parts(Vector3::zeros().into(), UnitQuaternion::from(rotation));
     let tree = SunTree::new(&shape, |_| Some(sun_from_world));
+    let mut everywhere = SunBox::EMPTY;
+    everywhere.add([0.0; 3], 1e3);
+    let mut entries = Vec::new();
+    tree.entries(&everywhere, &mut entries);
     let (mut dark, mut wrong, mut count) = (0, 0, 0);
     for i in 0..4000 {
         let f = |k: f64| 1.3 * shapes::noise(&Vector3::new(f64::from(i) * 0.73, k, 0.5), 1);
@@ -295,7 +304,7 @@ fn shadows_are_those_of_exact_ray_casts() {
             .coords
             .map(|c| c as f32);
         let lanes = [[s.x; 8], [s.y; 8], [s.z; 8]];
-        let found = tree.shaded::<Portable>(&lanes, 1) == 1;
+        let found = tree.shaded::<Portable>(&lanes, 1, &entries) == 1;
         count += 1;
         dark += usize::from(blocked);
         wrong += usize::from(blocked != found);

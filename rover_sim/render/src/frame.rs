@@ -9,11 +9,11 @@
 use crate::geometry::Geometry;
 use crate::optics::{Optics, SAMPLE_U, SAMPLE_V, TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, TileRays};
 use crate::plate::{PlateFace, PlateFrame};
-use crate::resolve::{Fragments, centroid};
+use crate::resolve::{Bodies, Fragments, centroid};
 use crate::scene::Sky;
 use crate::shading::{BodyFrame, Group, Light, MOVING, Material, Motion, Point, shade};
 use crate::shadow::{SunBox, SunTree};
-use crate::simd::{Lanes, Level, Simd, dispatched};
+use crate::simd::{Lanes, Level, Simd, dispatched, splat3, sub3};
 use crate::view::{Facet, View};
 use crate::visibility::{Samples, draw};
 use rayon::prelude::*;
@@ -25,10 +25,11 @@ pub(crate) struct Tile {
     /// they are; meaningful while `still_known`.
     still: Vec<Point>,
     still_lit: Vec<u8>,
-    still_box: Option<SunBox>,
+    still_box: SunBox,
     still_known: bool,
     /// Points of this frame, if moving facets touch the tile.
     now: Vec<Point>,
+    now_box: SunBox,
     now_holds: bool,
     /// Whether the sun reaches each point of this frame.
     lit: Vec<u8>,
@@ -42,6 +43,20 @@ pub(crate) struct Tile {
 }
 
 impl Tile {
+    /// Forgets what is known of the static scene; keeps the memory.
+    pub(crate) fn forget(&mut self) {
+        self.still_known = false;
+        self.radiance_still = false;
+    }
+
+    fn sun_box(&self) -> &SunBox {
+        if self.now_holds {
+            &self.now_box
+        } else {
+            &self.still_box
+        }
+    }
+
     fn points(&self) -> &[Point] {
         if self.now_holds {
             &self.now
@@ -78,6 +93,7 @@ pub(crate) struct Frame<'a> {
 struct Scratch {
     samples: Samples,
     fragments: Fragments,
+    entries: Vec<u32>,
 }
 
 impl Scratch {
@@ -85,6 +101,7 @@ impl Scratch {
         Self {
             samples: Samples::new(),
             fragments: Fragments::default(),
+            entries: Vec::new(),
         }
     }
 }
@@ -144,51 +161,43 @@ impl Frame<'_> {
     }
 
     fn visit(&self, index: usize, tile: &mut Tile, scratch: &mut Scratch) {
-        let rays = &self.optics.tiles[index];
         let moving = self.moving.touching(index);
         tile.now_holds = !moving.is_empty();
         if tile.now_holds {
             self.find_points(index, moving, scratch, &mut tile.now);
+            tile.now_box = sunny_box(&tile.now);
             tile.lit.clear();
             tile.lit.resize(tile.now.len(), 1);
-            let sun = SunSide {
-                tree: self.still_tree,
-                points: &tile.now,
-            };
-            darken(self.level, &sun, &mut tile.lit);
-            let sun = SunSide {
-                tree: self.moving_tree,
-                points: &tile.now,
-            };
-            darken(self.level, &sun, &mut tile.lit);
+            self.darken(
+                self.still_tree,
+                &tile.now,
+                &tile.now_box,
+                scratch,
+                &mut tile.lit,
+            );
+            self.darken(
+                self.moving_tree,
+                &tile.now,
+                &tile.now_box,
+                scratch,
+                &mut tile.lit,
+            );
             tile.touched = true;
         } else {
             if !tile.still_known {
                 self.find_points(index, &[], scratch, &mut tile.still);
-                tile.still_lit.clear();
-                tile.still_lit.resize(tile.still.len(), 1);
-                let sun = SunSide {
-                    tree: self.still_tree,
-                    points: &tile.still,
-                };
-                darken(self.level, &sun, &mut tile.still_lit);
-                let mut whole = SunBox::EMPTY;
-                for p in tile.still.iter().filter(|p| p.sunlight > 0.0) {
-                    whole.add(p.sun, p.reach);
-                }
-                tile.still_box = Some(whole);
+                tile.still_box = sunny_box(&tile.still);
+                let lit = &mut tile.still_lit;
+                lit.clear();
+                lit.resize(tile.still.len(), 1);
+                self.darken(self.still_tree, &tile.still, &tile.still_box, scratch, lit);
                 tile.still_known = true;
             }
             tile.lit.clone_from(&tile.still_lit);
-            tile.touched = tile
-                .still_box
-                .is_some_and(|b| self.moving_tree.may_shade(&b));
+            tile.touched = self.moving_tree.may_shade(&tile.still_box);
             if tile.touched {
-                let sun = SunSide {
-                    tree: self.moving_tree,
-                    points: &tile.still,
-                };
-                darken(self.level, &sun, &mut tile.lit);
+                let lit = &mut tile.lit;
+                self.darken(self.moving_tree, &tile.still, &tile.still_box, scratch, lit);
             }
         }
         tile.sunlight.clear();
@@ -203,7 +212,21 @@ impl Frame<'_> {
                 tile.sunlight[usize::from(point.pixel)] |= if lit == 1 { 1 } else { 2 };
             }
         }
-        debug_assert!(rays.columns > 0);
+    }
+
+    /// Clears `lit` where a point of a surface turned to the sun is in the shadow of `tree`.
+    fn darken(
+        &self,
+        tree: &SunTree,
+        points: &[Point],
+        points_box: &SunBox,
+        scratch: &mut Scratch,
+        lit: &mut [u8],
+    ) {
+        tree.entries(points_box, &mut scratch.entries);
+        if !scratch.entries.is_empty() {
+            darken(self.level, tree, &scratch.entries, points, lit);
+        }
     }
 
     /// Draws a tile and shades what is seen.
@@ -215,7 +238,9 @@ impl Frame<'_> {
         points: &mut Vec<Point>,
     ) {
         let rays = &self.optics.tiles[index];
-        let Scratch { samples, fragments } = scratch;
+        let Scratch {
+            samples, fragments, ..
+        } = scratch;
         samples.clear();
         draw(
             self.level,
@@ -234,13 +259,13 @@ impl Frame<'_> {
             samples,
         );
         let statics = self.still_geometry.bodies.len();
-        fragments.find(rays, samples, |facet| {
-            if facet & MOVING == 0 {
-                self.still.body[facet as usize]
-            } else {
-                self.moving.body[(facet & !MOVING) as usize] + statics as u16
-            }
-        });
+        let bodies = Bodies {
+            still: &self.still.body,
+            moving: &self.moving.body,
+            statics: statics as u16,
+            mark: MOVING,
+        };
+        fragments.find(self.level, rays, samples, bodies);
         points.clear();
         for group in fragments.list.chunk_by(|a, b| a.body == b.body) {
             let body = usize::from(group[0].body);
@@ -292,20 +317,23 @@ impl Frame<'_> {
     }
 }
 
-/// Points, and the bodies that may stand between them and the sun.
-struct SunSide<'a> {
-    tree: &'a SunTree,
-    points: &'a [Point],
+/// Where the points of a tile that are turned to the sun are, their samples included.
+fn sunny_box(points: &[Point]) -> SunBox {
+    let mut whole = SunBox::EMPTY;
+    for p in points.iter().filter(|p| p.sunlight > 0.0) {
+        whole.add(p.sun, p.reach);
+    }
+    whole
 }
 
 dispatched! {
-    /// Clears `lit` where a point of a surface turned to the sun is in shadow.
-    fn darken = darken_kernel(side: &SunSide<'_>, lit: &mut [u8])
+    /// See [`Frame::darken`].
+    fn darken = darken_kernel(tree: &SunTree, entries: &[u32], points: &[Point], lit: &mut [u8])
 }
 
 #[inline(always)]
-fn darken_kernel<S: Simd>(side: &SunSide<'_>, lit: &mut [u8]) {
-    for (points, lit) in side.points.chunks(8).zip(lit.chunks_mut(8)) {
+fn darken_kernel<S: Simd>(tree: &SunTree, entries: &[u32], points: &[Point], lit: &mut [u8]) {
+    for (points, lit) in points.chunks(8).zip(lit.chunks_mut(8)) {
         let mut places = [[0.0_f32; 8]; 3];
         let mut active = 0;
         for (lane, point) in points.iter().enumerate() {
@@ -314,7 +342,7 @@ fn darken_kernel<S: Simd>(side: &SunSide<'_>, lit: &mut [u8]) {
             }
             active |= u32::from(point.sunlight > 0.0 && lit[lane] == 1) << lane;
         }
-        let shaded = side.tree.shaded::<S>(&places, active);
+        let shaded = tree.shaded::<S>(&places, active, entries);
         for (lane, l) in lit.iter_mut().enumerate() {
             if shaded >> lane & 1 == 1 {
                 *l = 0;
@@ -341,6 +369,15 @@ impl SunlightMap {
             }
         }
         Self { stride, cells }
+    }
+
+    /// Whether there is both light and shadow in and around the tile that begins at `(u, v)`.
+    fn any_mixed(&self, u: usize, v: usize) -> bool {
+        let bits = (v..v + TILE_HEIGHT + 2).fold(0, |all, row| {
+            let cells = &self.cells[row * self.stride + u..][..TILE_WIDTH + 2];
+            all | cells.iter().fold(0, |b, c| b | c)
+        });
+        bits == 3
     }
 
     /// Whether there is both light and shadow in the 3x3 pixels around pixel `(u, v)`.
@@ -377,12 +414,21 @@ fn finish_kernel<S: Simd>(
     radiance.clear();
     radiance.resize(TILE_PIXELS, 0.0);
     let mut covered = [0_u8; TILE_PIXELS];
+    let any_edges = sunlight.any_mixed(u, v);
+    let mut begin = [Vec::new(), Vec::new()];
+    if any_edges {
+        frame.still_tree.entries(tile.sun_box(), &mut begin[0]);
+        frame.moving_tree.entries(tile.sun_box(), &mut begin[1]);
+    }
     for (point, &lit) in tile.points().iter().zip(&tile.lit) {
         let pixel = usize::from(point.pixel);
         let count = point.mask.count_ones();
         let mut visible = f32::from(lit);
-        if point.edges && sunlight.mixed(u + pixel % TILE_WIDTH, v + pixel / TILE_WIDTH) {
-            let dark = shaded_samples::<S>(frame, rays, point, tile.touched);
+        if any_edges
+            && point.edges
+            && sunlight.mixed(u + pixel % TILE_WIDTH, v + pixel / TILE_WIDTH)
+        {
+            let dark = shaded_samples::<S>(frame, rays, point, &begin);
             visible = (count - dark.count_ones()) as f32 / count as f32;
         }
         let weight = count as f32 * (1.0 / 16.0);
@@ -399,13 +445,13 @@ fn finish_kernel<S: Simd>(
 }
 
 /// Which of a point's samples are in shadow. The samples lie on the plane of the point's facet,
-/// shifted as the point itself was.
+/// shifted as the point itself was. `begin`: where to search in the trees.
 #[inline(always)]
 fn shaded_samples<S: Simd>(
     frame: &Frame<'_>,
     rays: &TileRays,
     point: &Point,
-    touched: bool,
+    begin: &[Vec<u32>; 2],
 ) -> u16 {
     let facet = frame.facet(point.facet);
     let plane = &facet.inverse_depth;
@@ -428,7 +474,7 @@ fn shaded_samples<S: Simd>(
         [S::splat(middle[0]), S::splat(middle[1])],
         S::splat(inverse),
     );
-    let shift = [0, 1, 2].map(|k| S::splat(point.sun[k]) - own[k]);
+    let shift = sub3::<S>(splat3::<S>(point.sun), own);
     let mut dark = 0;
     for half in 0..2 {
         let active = u32::from(point.mask >> (8 * half)) & 0xff;
@@ -436,8 +482,10 @@ fn shaded_samples<S: Simd>(
             continue;
         }
         let (ou, ov) = (S::load(&SAMPLE_U[half]), S::load(&SAMPLE_V[half]));
-        let ray = [0, 1]
-            .map(|k| S::splat([x, y][k]) + ou * S::splat(rays.du[k]) + ov * S::splat(rays.dv[k]));
+        let ray = [
+            S::splat(x) + ou * S::splat(rays.du[0]) + ov * S::splat(rays.dv[0]),
+            S::splat(y) + ou * S::splat(rays.du[1]) + ov * S::splat(rays.dv[1]),
+        ];
         let w = S::splat(plane[0]) * ray[0] + S::splat(plane[1]) * ray[1] + S::splat(plane[2]);
         let near = S::and(S::ge(w, limits.0), S::ge(limits.1, w));
         let w = S::select(near, w, S::splat(inverse));
@@ -446,10 +494,10 @@ fn shaded_samples<S: Simd>(
         for k in 0..3 {
             S::store(at[k] + shift[k], &mut places[k]);
         }
-        let mut shaded = frame.still_tree.shaded::<S>(&places, active);
-        if touched {
-            shaded |= frame.moving_tree.shaded::<S>(&places, active & !shaded);
-        }
+        let mut shaded = frame.still_tree.shaded::<S>(&places, active, &begin[0]);
+        shaded |= frame
+            .moving_tree
+            .shaded::<S>(&places, active & !shaded, &begin[1]);
         dark |= (shaded as u16) << (8 * half);
     }
     dark

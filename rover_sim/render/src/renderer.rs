@@ -24,7 +24,10 @@ struct Eye {
     optics: Optics,
     parameters: ImagingParameters,
     world_from_camera: Isometry3<f64>,
-    still: Option<View>,
+    /// The static scene, and whether it is as seen from here.
+    still: View,
+    still_seen: bool,
+    moving: View,
     tiles: Vec<Tile>,
 }
 
@@ -122,7 +125,9 @@ impl Renderer {
             optics,
             parameters,
             world_from_camera: Isometry3::identity(),
-            still: None,
+            still: View::default(),
+            still_seen: false,
+            moving: View::default(),
             tiles: Vec::new(),
         });
         Ok(CameraId(self.eyes.len() - 1))
@@ -279,7 +284,7 @@ impl Renderer {
     }
 
     /// Forgets what is kept of a camera's last images, so that the next one is drawn in full. No
-    /// image changes by this; it is for measuring and for releasing memory.
+    /// image changes by this; it is for measuring.
     ///
     /// # Errors
     /// [`RenderError::NoSuchCamera`].
@@ -310,8 +315,8 @@ impl Renderer {
 
 impl Eye {
     fn forget(&mut self) {
-        self.still = None;
-        self.tiles.clear();
+        self.still_seen = false;
+        self.tiles.iter_mut().for_each(Tile::forget);
     }
 
     fn world_from_axis(&self) -> Isometry3<f64> {
@@ -375,12 +380,13 @@ impl Stage {
         let world_from_axis = eye.world_from_axis();
         let axis_from_world = world_from_axis.inverse();
         let optics = &eye.optics;
-        let still = eye.still.get_or_insert_with(|| {
-            View::new(optics, &self.still, |b| {
+        if !eye.still_seen {
+            eye.still.see(optics, &self.still, |b| {
                 self.present[b].then_some(axis_from_world)
-            })
-        });
-        let moving = View::new(optics, &self.moving, |b| {
+            });
+            eye.still_seen = true;
+        }
+        eye.moving.see(optics, &self.moving, |b| {
             Some(axis_from_world * moment.world_from_moving[b])
         });
         let to_sun = self.scene.sun.direction_to_sun.into_inner();
@@ -397,8 +403,8 @@ impl Stage {
         let frame = Frame {
             level: self.level,
             optics,
-            still,
-            moving: &moving,
+            still: &eye.still,
+            moving: &eye.moving,
             still_geometry: &self.still,
             moving_geometry: &self.moving,
             still_frame: frame_of(&Isometry3::identity()),

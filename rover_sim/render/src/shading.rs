@@ -225,12 +225,16 @@ fn shade_eight<S: Simd>(group: &Group<'_>, eight: &[Fragment], out: &mut Vec<Poi
     let g = gather(group, eight);
     let (zero, one) = (S::splat(0.0), S::splat(1.0));
     let ray = [S::load(&g.ray[0]), S::load(&g.ray[1]), one];
-    let weights = g
-        .edge
-        .each_ref()
-        .map(|e| S::max(dot::<S>(load3::<S>(e), ray), zero));
+    let mut weights = [zero; 3];
+    let mut corner_normals = [[zero; 3]; 3];
+    for k in 0..3 {
+        weights[k] = S::max(dot::<S>(load3::<S>(&g.edge[k]), ray), zero);
+        corner_normals[k] = load3::<S>(&g.normal[k]);
+    }
     let total = S::max(weights[0] + weights[1] + weights[2], S::splat(1e-30));
-    let weights = weights.map(|w| w / total);
+    for w in &mut weights {
+        *w = *w / total;
+    }
     let plane = load3::<S>(&g.inverse_depth);
     let inverse_depth = dot::<S>(plane, ray);
     let depth = one / S::max(inverse_depth, S::splat(1e-6));
@@ -239,7 +243,6 @@ fn shade_eight<S: Simd>(group: &Group<'_>, eight: &[Fragment], out: &mut Vec<Poi
         .body_from_axis
         .apply::<S>(scale3::<S>(ray, depth));
 
-    let corner_normals = g.normal.each_ref().map(|n| load3::<S>(n));
     let mut normal = [zero; 3];
     for k in 0..3 {
         normal = add3::<S>(normal, scale3::<S>(corner_normals[k], weights[k]));

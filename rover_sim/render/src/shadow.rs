@@ -38,6 +38,12 @@ pub(crate) struct SunBox {
     pub bottom: f32,
 }
 
+impl Default for SunBox {
+    fn default() -> Self {
+        Self::EMPTY
+    }
+}
+
 impl SunBox {
     pub(crate) const EMPTY: Self = Self {
         low: [f32::MAX; 2],
@@ -68,8 +74,10 @@ const CLEARANCE_M: f32 = 1.5e-4;
 /// Blockers overlap by this fraction of their size against light through the seams.
 const SEAM: f32 = 1e-4;
 const LEAF: usize = 4;
-/// The median split halves the count at each level, so 32 levels are never reached.
-const DEPTH: usize = 64;
+/// Most nodes at which a search begins.
+const ENTRIES: usize = 16;
+/// Room for a search: its beginning, and at most 32 levels, as the median split halves the count.
+const DEPTH: usize = ENTRIES + 34;
 
 impl SunTree {
     /// `sun_from_body(b)` is `None` for a body that is not there.
@@ -149,12 +157,37 @@ impl SunTree {
         self.nodes[node] = this;
     }
 
+    /// The nodes at which to begin for points within a box: all that may shade it, as deep in the
+    /// tree as a short list allows. Empty if nothing can shade the box.
+    pub(crate) fn entries(&self, target: &SunBox, out: &mut Vec<u32>) {
+        out.clear();
+        let meets = |index: u32| {
+            let n = &self.nodes[index as usize];
+            n.top > target.bottom
+                && (0..2).all(|k| n.high[k] >= target.low[k] && n.low[k] <= target.high[k])
+        };
+        if !self.nodes.is_empty() && meets(0) {
+            out.push(0);
+        }
+        // each round replaces the inner nodes by those of their children that meet the box
+        let mut expanded = true;
+        while expanded && out.len() <= ENTRIES / 2 {
+            expanded = false;
+            for i in (0..out.len()).rev() {
+                let n = &self.nodes[out[i] as usize];
+                if n.count == 0 {
+                    expanded = true;
+                    out.swap_remove(i);
+                    out.extend([n.first, n.first + 1].into_iter().filter(|&c| meets(c)));
+                }
+            }
+        }
+    }
+
     /// Whether anything may cast its shadow into a box.
     pub(crate) fn may_shade(&self, target: &SunBox) -> bool {
-        if self.nodes.is_empty() {
-            return false;
-        }
-        let mut stack = vec![0_u32];
+        let mut stack = Vec::new();
+        self.entries(target, &mut stack);
         while let Some(index) = stack.pop() {
             let n = &self.nodes[index as usize];
             let apart = n.top <= target.bottom
@@ -177,17 +210,19 @@ impl SunTree {
         false
     }
 
-    /// Which of the `active` ones of eight points (sun frame) lie in shadow, one bit each.
+    /// Which of the `active` ones of eight points (sun frame) lie in shadow, one bit each. The
+    /// points lie in the box for which `entries` were found.
     #[inline(always)]
-    pub(crate) fn shaded<S: Simd>(&self, p: &[Lanes; 3], active: u32) -> u32 {
+    pub(crate) fn shaded<S: Simd>(&self, p: &[Lanes; 3], active: u32, entries: &[u32]) -> u32 {
         let mut hits = 0;
-        if self.nodes.is_empty() || active == 0 {
+        if entries.is_empty() || active == 0 {
             return 0;
         }
         let (x, y) = (S::load(&p[0]), S::load(&p[1]));
         let z = S::load(&p[2]) + S::splat(CLEARANCE_M);
         let mut stack = [0_u32; DEPTH];
-        let mut depth = 1;
+        let mut depth = entries.len();
+        stack[..depth].copy_from_slice(entries);
         while depth > 0 {
             depth -= 1;
             let n = &self.nodes[stack[depth] as usize];

@@ -5,7 +5,8 @@
 //! fused multiply-add and no reciprocal estimates.
 //!
 //! All functions are `inline(always)`: an intrinsic that is not inlined into a function compiled
-//! with AVX2 becomes a call, fifty times slower.
+//! with AVX2 becomes a call, fifty times slower. For the same reason kernels hold no closures (not
+//! even those of `array::map`): a closure is a function of its own.
 
 use std::ops::{Add, Div, Mul, Sub};
 
@@ -39,6 +40,7 @@ pub(crate) trait Simd: Copy {
     fn select(m: Self::M, a: Self::F, b: Self::F) -> Self::F;
     fn select_i(m: Self::M, a: Self::I, b: Self::I) -> Self::I;
 
+    fn eq_i(a: Self::I, b: Self::I) -> Self::M;
     fn splat_i(x: u32) -> Self::I;
     fn load_i(x: &[u32; 8]) -> Self::I;
     fn store_i(x: Self::I, out: &mut [u32; 8]);
@@ -208,6 +210,10 @@ impl Simd for Portable {
             out[i] = (a[i] & m[i]) | (b[i] & !m[i]);
         }
         out
+    }
+    #[inline(always)]
+    fn eq_i(a: [u32; 8], b: [u32; 8]) -> [u32; 8] {
+        map2(&a, &b, |x, y| if x == y { u32::MAX } else { 0 })
     }
     #[inline(always)]
     fn splat_i(x: u32) -> [u32; 8] {

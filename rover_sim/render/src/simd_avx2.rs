@@ -95,6 +95,10 @@ impl Simd for Avx2 {
         }
     }
     #[inline(always)]
+    fn eq_i(a: __m256i, b: __m256i) -> __m256 {
+        unsafe { _mm256_castsi256_ps(_mm256_cmpeq_epi32(a, b)) }
+    }
+    #[inline(always)]
     fn splat_i(x: u32) -> __m256i {
         unsafe { _mm256_set1_epi32(x as i32) }
     }

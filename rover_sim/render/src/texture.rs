@@ -127,8 +127,12 @@ fn value_noise<S: Simd>(q: V3<S>, seed: u32) -> (S::F, V3<S>) {
         S::xor_i(low[0], high[1]),
         S::xor_i(high[0], high[1]),
     ];
-    let near = xy.map(|h| lattice_value::<S>(S::xor_i(h, low[2])));
-    let far = xy.map(|h| lattice_value::<S>(S::xor_i(h, high[2])));
+    let mut near = [one; 4];
+    let mut far = [one; 4];
+    for k in 0..4 {
+        near[k] = lattice_value::<S>(S::xor_i(xy[k], low[2]));
+        far[k] = lattice_value::<S>(S::xor_i(xy[k], high[2]));
+    }
     // along x
     let (n0, n1) = (
         lerp::<S>(near[0], near[1], step[0]),

@@ -23,9 +23,12 @@ pub(crate) struct View {
     pub triangle: Vec<u32>,
     /// Body of each facet.
     pub body: Vec<u16>,
-    /// For each tile, where its list in `refs` begins; one more entry at the end.
+    /// For each tile, where its list in `refs` begins; more entries at the end.
     starts: Vec<u32>,
     refs: Vec<u32>,
+    /// Room for the making: vertices in the axis frame, pairs (tile, facet).
+    vertices: Vec<[f32; 3]>,
+    touches: Vec<(u32, u32)>,
 }
 
 /// Nothing nearer than this (along the axis) has bounds of its own, metres.
@@ -33,14 +36,18 @@ const NEAR_M: f32 = 1e-4;
 
 impl View {
     /// Sees `geometry` through `optics`; `axis_from_body(b)` is `None` for a body not to be drawn.
-    pub(crate) fn new(
+    /// The memory of the last view is used again.
+    pub(crate) fn see(
+        &mut self,
         optics: &Optics,
         geometry: &Geometry,
         axis_from_body: impl Fn(usize) -> Option<Isometry3<f64>>,
-    ) -> Self {
-        let mut vertices = vec![[0.0_f32; 3]; geometry.positions.len()];
-        let mut view = Self::default();
-        let mut touches: Vec<(u32, u32)> = Vec::new();
+    ) {
+        self.facets.clear();
+        self.triangle.clear();
+        self.body.clear();
+        self.touches.clear();
+        self.vertices.resize(geometry.positions.len(), [0.0; 3]);
         for (index, body) in geometry.bodies.iter().enumerate() {
             let Some(pose) = axis_from_body(index) else {
                 continue;
@@ -51,40 +58,40 @@ impl View {
             );
             for v in body.vertices.clone() {
                 let p = rotation * geometry.positions[v] + shift;
-                vertices[v] = [p.x as f32, p.y as f32, p.z as f32];
+                self.vertices[v] = [p.x as f32, p.y as f32, p.z as f32];
             }
             for t in body.triangles.clone() {
-                let [a, b, c] = geometry.triangles[t].map(|i| vertices[i as usize]);
+                let [a, b, c] = geometry.triangles[t].map(|i| self.vertices[i as usize]);
                 let Some(facet) = facet(a, b, c, body.two_sided) else {
                     continue;
                 };
-                let id = view.facets.len() as u32;
-                let before = touches.len();
-                optics.tiles_touching(&facet.bounds, |tile| touches.push((tile as u32, id)));
-                if touches.len() > before {
-                    view.facets.push(facet);
-                    view.triangle.push(t as u32);
-                    view.body.push(index as u16);
+                let id = self.facets.len() as u32;
+                let before = self.touches.len();
+                optics.tiles_touching(&facet.bounds, |tile| self.touches.push((tile as u32, id)));
+                if self.touches.len() > before {
+                    self.facets.push(facet);
+                    self.triangle.push(t as u32);
+                    self.body.push(index as u16);
                 }
             }
         }
-        view.sort(touches, optics.tiles.len());
-        view
+        self.sort(optics.tiles.len());
     }
 
-    /// Puts the pairs (tile, facet) into one list per tile, facets in ascending order.
-    fn sort(&mut self, touches: Vec<(u32, u32)>, tiles: usize) {
-        self.starts = vec![0; tiles + 1];
-        for &(tile, _) in &touches {
-            self.starts[tile as usize + 1] += 1;
+    /// Makes one list per tile from the pairs (tile, facet), facets in ascending order.
+    fn sort(&mut self, tiles: usize) {
+        self.starts.clear();
+        self.starts.resize(tiles + 2, 0);
+        for &(tile, _) in &self.touches {
+            self.starts[tile as usize + 2] += 1;
         }
-        for tile in 0..tiles {
-            self.starts[tile + 1] += self.starts[tile];
+        for tile in 2..tiles + 2 {
+            self.starts[tile] += self.starts[tile - 1];
         }
-        let mut next = self.starts.clone();
-        self.refs = vec![0; touches.len()];
-        for (tile, facet) in touches {
-            let slot = &mut next[tile as usize];
+        // one place ahead: filling a list moves its entry to where the next list begins
+        self.refs.resize(self.touches.len(), 0);
+        for &(tile, facet) in &self.touches {
+            let slot = &mut self.starts[tile as usize + 1];
             self.refs[*slot as usize] = facet;
             *slot += 1;
         }
