@@ -257,7 +257,7 @@ impl Default for DriverDescription {
         Self {
             start_tolerance_rad: 2e-3,
             max_following_error_rad: 0.02,
-            stop_ramp_s: 0.06,
+            stop_ramp_s: 0.025,
             rest_rate_rad_s: 2e-5,
             settle_limit_s: 2.0,
         }

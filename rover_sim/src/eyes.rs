@@ -261,6 +261,12 @@ impl Eyes {
         })
     }
 
+    /// Where a ray meets the terrain, world frame, m.
+    #[cfg(test)]
+    pub(crate) fn cast(&self, origin: &Vector3<f64>, along: &Vector3<f64>) -> Option<Vector3<f64>> {
+        self.renderer.cast(origin, along, None).map(|hit| hit.point)
+    }
+
     /// Removes what has vanished from the world since the last picture.
     fn follow(&mut self, moment: &Moment) -> Result<(), Fault> {
         for &body in &moment.gone {

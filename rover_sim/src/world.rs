@@ -3,6 +3,9 @@
 //! A plain value: no network, no threads, no clock but the steps that it is told to make. Two
 //! worlds built from the same description and seed and told the same give the same bits.
 
+mod motion;
+mod observation;
+
 use crate::{
     SimulationError,
     arm::{ArmModel, ArmPhysics, StaticSurface, TipContact},
@@ -10,32 +13,24 @@ use crate::{
     contact_switch::Switch,
     description::{Moment as FaultMoment, SimulationDescription},
     driver::{Driver, Phase},
-    eyes::{Eyes, Moment, SurfacePoint},
+    eyes::{Eyes, SurfacePoint},
     statics,
     terrain::Terrain,
     truth::Truth,
 };
+use motion::Record;
 use nalgebra::{Unit, Vector3};
-use rover_kinematics::JointTrajectory;
 use rover_messages::{
     Fault,
-    arm::{ArmState, ExecuteResult, Guard, Motion, StopReason},
-    imaging::RawPair,
+    arm::{ExecuteResult, StopReason},
     keys::service::HARDWARE,
-    simulation::{InjectedFault, TruthState, View, ViewRequest},
 };
-use rover_render::FrameState;
 use rover_robot::Robot;
 use std::{
-    sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicU64, Ordering},
-    },
+    sync::{Arc, Mutex, MutexGuard, PoisonError, atomic::AtomicU64},
     time::Instant,
 };
 
-/// Trajectories must begin and end slower than this, rad/s.
-const REST_RATE_RAD_S: f64 = 1e-3;
 /// Consecutive steps below the rest rate that count as rest.
 const REST_STEPS: u32 = 5;
 /// Force on a link above which it counts as touching something, N.
@@ -70,18 +65,6 @@ pub struct Collision {
     pub link_n: usize,
     /// Largest force so far, N.
     pub force_n: f64,
-}
-
-/// What is kept of the motion under way.
-#[derive(Default)]
-struct Record {
-    started_closed: bool,
-    peak_force_n: f64,
-    joints_at_contact_rad: Option<Vec<f64>>,
-    stopped_at_s: Option<f64>,
-    still_at_s: Option<f64>,
-    calm_steps: u32,
-    settling_steps: u64,
 }
 
 /// The simulated world.
@@ -186,7 +169,12 @@ impl World {
         };
         world.come_to_rest();
         if let Some(target) = &description.target {
-            world.designate(&target.pair, target.pixel_px)?;
+            let found = world.designate(&target.pair, target.pixel_px);
+            // Only occlusion needs the point from the start; a pixel in the sky is for target
+            // selection to refuse.
+            if description.occlusion.is_some() {
+                found?;
+            }
         }
         Ok(world)
     }
@@ -271,75 +259,6 @@ impl World {
         Ok(point)
     }
 
-    /// Begins a motion.
-    ///
-    /// # Errors
-    /// Fault `busy`, `trajectory_invalid` (with the kinematics' words) or `start_mismatch` (with
-    /// the joint, the angle found and the angle expected).
-    pub fn start(&mut self, trajectory: JointTrajectory, guard: Guard) -> Result<(), Fault> {
-        let refuse = |name, message| Err(Fault::new(HARDWARE, name, message));
-        if self.is_moving() {
-            return refuse(
-                "busy",
-                "a motion is under way; stop it or wait for its end".into(),
-            );
-        }
-        if let Err(e) = trajectory.validate(&self.robot.arm) {
-            return refuse("trajectory_invalid", e.to_string());
-        }
-        let (Some(first), Some(last)) = (trajectory.points.first(), trajectory.points.last())
-        else {
-            return refuse("trajectory_invalid", "no points".into());
-        };
-        for (what, point) in [("first", first), ("last", last)] {
-            if let Some(j) = point
-                .qd_rad_s
-                .iter()
-                .position(|r| r.abs() > REST_RATE_RAD_S)
-            {
-                let rate = point.qd_rad_s[j];
-                let message =
-                    format!("the {what} point moves joint {j} at {rate} rad/s, expected rest");
-                return refuse("trajectory_invalid", message);
-            }
-        }
-        let tolerance =
-            self.description.driver.start_tolerance_rad + 6.0 * self.truth.encoder_noise_rad;
-        for (joint, (found, &present)) in first.q_rad.iter().zip(&self.driver.motor_rad).enumerate()
-        {
-            let apart = found - present;
-            if apart.abs() > tolerance {
-                let message = format!(
-                    "the trajectory starts joint {joint} at {found} rad, the encoder reads \
-                     {present} rad; expected within {tolerance} rad"
-                );
-                return Err(Fault::new(HARDWARE, "start_mismatch", message)
-                    .with("joint_n", joint as f64)
-                    .with("apart_rad", apart));
-            }
-        }
-        self.driver.start(trajectory, guard);
-        self.record = Record {
-            started_closed: self.switch.closed,
-            ..Record::default()
-        };
-        if !self.has_moved {
-            self.has_moved = true;
-            self.vanish(|when| matches!(when, FaultMoment::FirstArmMotion));
-        }
-        Ok(())
-    }
-
-    /// Stops a motion: the motors slow down along the trajectory, within their acceleration if
-    /// that takes no longer than the driver's stop ramp. Time must be granted by
-    /// [`Self::advance`] until the motion has ended.
-    pub fn stop(&mut self, reason: StopReason) {
-        if self.driver.phase == Phase::Following {
-            self.record.stopped_at_s = Some(self.sim_time_s());
-            self.driver.stop(reason);
-        }
-    }
-
     /// Grants heartbeat periods; ends early, in the very step, when a motion ends.
     pub fn advance(&mut self, periods: u32) -> Advance {
         let start = Instant::now();
@@ -412,82 +331,6 @@ impl World {
         }
     }
 
-    /// Watches force and rest; the outcome when the motion has ended.
-    fn supervise(&mut self) -> Option<Result<ExecuteResult, Fault>> {
-        let force_n = self.tip_force_n();
-        self.record.peak_force_n = self.record.peak_force_n.max(force_n);
-        if let Some(limit_n) = self.driver.max_force_n()
-            && force_n > limit_n
-        {
-            self.stop(StopReason::Force {
-                found_n: force_n,
-                limit_n,
-            });
-        }
-        if self.driver.phase != Phase::Settling {
-            return None;
-        }
-        let now = self.sim_time_s();
-        self.record.still_at_s.get_or_insert(now);
-        self.record.settling_steps += 1;
-        self.record.calm_steps = if self.is_calm() {
-            self.record.calm_steps + 1
-        } else {
-            0
-        };
-        if self.record.calm_steps >= REST_STEPS {
-            return Some(self.conclude());
-        }
-        let waited_s = self.record.settling_steps as f64 * self.description.step_s;
-        if waited_s < self.description.driver.settle_limit_s {
-            return None;
-        }
-        let fastest = self
-            .rates_rad_s
-            .iter()
-            .fold(0.0, |m: f64, r| m.max(r.abs()));
-        self.driver.finish();
-        let message = format!("the arm does not come to rest: {fastest} rad/s after {waited_s} s");
-        Some(Err(Fault::new(HARDWARE, "arm_not_at_rest", message)
-            .with("rate_rad_s", fastest)
-            .with("waited_s", waited_s)))
-    }
-
-    fn is_calm(&self) -> bool {
-        let limit = self.description.driver.rest_rate_rad_s;
-        self.rates_rad_s.iter().all(|r| r.abs() < limit)
-    }
-
-    /// Ends the motion; a stop on contact or force is a result, any other stop a fault.
-    fn conclude(&mut self) -> Result<ExecuteResult, Fault> {
-        self.driver.finish();
-        let record = std::mem::take(&mut self.record);
-        let state = self.state();
-        let reason = state.stop_reason.clone();
-        let name = match &reason {
-            None | Some(StopReason::Contact | StopReason::Force { .. }) => {
-                return Ok(ExecuteResult {
-                    completed: reason.is_none(),
-                    peak_force_n: record.peak_force_n,
-                    joints_at_contact_rad: record.joints_at_contact_rad,
-                    state,
-                });
-            }
-            Some(StopReason::Deviation { .. }) => "path_deviation",
-            Some(StopReason::Cancelled) => "cancelled",
-            Some(StopReason::StopCommand) => "stopped",
-            Some(StopReason::CommanderLost { .. }) => "commander_lost",
-        };
-        let message = reason.map_or_else(String::new, |r| format!("the arm was stopped: {r}"));
-        let mut fault = Fault::new(HARDWARE, name, message);
-        if let (Some(stop), Some(still)) = (record.stopped_at_s, record.still_at_s) {
-            fault = fault
-                .with("still_after_ms", (still - stop) * 1e3)
-                .with("rest_after_ms", (self.sim_time_s() - stop) * 1e3);
-        }
-        Err(fault)
-    }
-
     fn tip_force_n(&self) -> f64 {
         self.tip.map_or(0.0, |t| t.axial_force_n.max(0.0))
     }
@@ -500,122 +343,6 @@ impl World {
             .zip(noise)
             .map(|(q, n)| q + n)
             .collect()
-    }
-
-    /// The arm as its encoders and switch report it.
-    pub fn state(&self) -> ArmState {
-        ArmState {
-            sim_time_s: self.sim_time_s(),
-            step: self.step,
-            joints_rad: self.encoder_angles_rad(),
-            rates_rad_s: self.driver.motor_rate_rad_s.clone(),
-            contact: self.switch.closed,
-            switch_travel_m: self.arm.switch_travel_m().max(0.0),
-            tip_force_n: self.tip_force_n(),
-            motion: match self.driver.phase {
-                Phase::Idle => Motion::Idle,
-                Phase::Ramping => Motion::Stopping,
-                Phase::Settling if self.driver.stop_reason.is_some() => Motion::Stopping,
-                Phase::Following | Phase::Settling => Motion::Moving,
-            },
-            stop_reason: self.driver.stop_reason.clone(),
-        }
-    }
-
-    /// Time since the start of the motion under way, s.
-    pub fn elapsed_s(&self) -> f64 {
-        self.driver.elapsed_s()
-    }
-
-    /// The first uncontrolled contact so far.
-    pub fn collision(&self) -> Option<Collision> {
-        self.collision
-    }
-
-    /// The scene at this instant.
-    pub fn moment(&self) -> Moment {
-        let mut part_poses: Vec<_> = (0..self.model.links.len())
-            .map(|i| self.arm.world_from_link(i))
-            .collect();
-        part_poses.push(self.arm.world_from_plunger());
-        Moment {
-            sim_time_s: self.sim_time_s(),
-            step: self.step,
-            frame: FrameState {
-                part_poses,
-                pattern_visible: !self.is_fiducial_hidden(),
-            },
-            gone: self.gone.clone(),
-        }
-    }
-
-    fn is_fiducial_hidden(&self) -> bool {
-        let occluded = match (&self.description.occlusion, &self.designated) {
-            (Some(o), Some((_, target))) => {
-                let apart = (self.arm.tip_in_world() - target.point_m).norm();
-                apart < o.fiducial_hidden_within_m
-            }
-            _ => false,
-        };
-        self.fiducial_hidden || occluded
-    }
-
-    /// The cameras, shared: pictures of a [`Moment`] can be taken while the world goes on.
-    pub fn eyes(&self) -> Arc<Mutex<Eyes>> {
-        self.eyes.clone()
-    }
-
-    /// Takes one stereo pair now.
-    ///
-    /// # Errors
-    /// As [`Eyes::grab`].
-    pub fn grab(&self, pair: &str, exposure_n: u32) -> Result<RawPair, Fault> {
-        lock(&self.eyes).grab(&self.moment(), pair, exposure_n)
-    }
-
-    /// What an outside camera sees now.
-    ///
-    /// # Errors
-    /// As [`Eyes::view`].
-    pub fn view(&self, request: &ViewRequest) -> Result<View, Fault> {
-        lock(&self.eyes).view(&self.moment(), request)
-    }
-
-    /// What the simulator knows about the truth.
-    pub fn truth_state(&self) -> TruthState {
-        TruthState {
-            sim_time_s: self.sim_time_s(),
-            tip_in_world_m: self.arm.tip_in_world().into(),
-            joints_rad: self.joints_rad.clone(),
-            physics_wall_s: self.physics_wall_s,
-            rendering_wall_s: self.rendering_wall.load(Ordering::Relaxed) as f64 * 1e-9,
-            steps: self.step,
-            collision: self.collision.map(|c| (c.sim_time_s, c.link_n as u32)),
-        }
-    }
-
-    /// The true position of the tip (plunger released), world frame, m.
-    pub fn tip_in_world(&self) -> Vector3<f64> {
-        self.arm.tip_in_world()
-    }
-
-    /// Shows a fault from now on.
-    ///
-    /// # Errors
-    /// Fault `unknown_rock` with the number of rocks there are.
-    pub fn inject(&mut self, fault: &InjectedFault) -> Result<(), Fault> {
-        match fault {
-            InjectedFault::FiducialHidden(hidden) => self.fiducial_hidden = *hidden,
-            InjectedFault::SwitchDead(dead) => self.switch.dead = *dead,
-            InjectedFault::RockVanishes(rock_n) => {
-                let body = self.terrain.rock(*rock_n).ok_or_else(|| {
-                    let message = format!("rock {rock_n}, expected below {}", self.terrain.rocks_n);
-                    Fault::new(HARDWARE, "unknown_rock", message)
-                })?;
-                self.remove_body(body);
-            }
-        }
-        Ok(())
     }
 
     /// Lets the described rock vanish if its moment has come.

@@ -56,7 +56,7 @@ impl LaunchError {
     pub(crate) fn bus(name: &str) -> impl Fn(BusError) -> Self {
         move |error| Self::Bus {
             name: name.into(),
-            error,
+            error: Box::new(error),
         }
     }
 

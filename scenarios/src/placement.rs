@@ -143,7 +143,8 @@ impl<'a> Mission<'a> {
         if ended.is_err() {
             self.stop_arm().await;
         }
-        if let Some(target) = record.target.clone() {
+        let scoring = self.peer.is_present(keys::service::HARDWARE).await.unwrap_or(false);
+        if let Some(target) = record.target.clone().filter(|_| scoring) {
             let scored = self.score(&target).await;
             match scored {
                 Ok(score) => record.score = Some(score),

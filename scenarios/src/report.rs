@@ -258,7 +258,7 @@ impl RunReport {
             line(
                 "servo",
                 format!(
-                    "{}, {} looks, fiducial found in {found}{}, predicted error {:.2} mm (1 sigma)",
+                    "{}, {} looks, fiducial found in {found}{}, predicted error {:.2} mm (95 %)",
                     s.method,
                     s.iterations,
                     if s.converged { ", converged" } else { "" },

@@ -70,6 +70,10 @@ impl NetworkConfig {
     /// unreadable file or a value that Zenoh refuses.
     pub fn to_zenoh(&self) -> Result<zenoh::Config, BusError> {
         check_name("peer name", &self.name)?;
+        let own_namespace = !self.namespace.is_empty() || self.file.is_none();
+        if own_namespace {
+            check_namespace(&self.namespace)?;
+        }
         let mut config = match &self.file {
             Some(path) => zenoh::Config::from_file(path).map_err(|e| BusError::Config {
                 setting: path.display().to_string(),
@@ -78,8 +82,7 @@ impl NetworkConfig {
             None => self.defaults()?,
         };
         let mut on_top = Vec::new();
-        if !self.namespace.is_empty() || self.file.is_none() {
-            check_namespace(&self.namespace)?;
+        if own_namespace {
             on_top.push(("namespace", json(&self.namespace)));
         }
         if !self.listen.is_empty() {

@@ -4,12 +4,15 @@ use crate::{
     BusError, NetworkConfig,
     config::check_key,
     exchange::{Form, Question, read},
-    presence::Roll,
+    presence::{Roll, answer_roll_call},
 };
 use rover_messages::{Fault, codec::MAX_PAYLOAD_BYTES};
 use std::{
     collections::HashMap,
-    sync::{Arc, Mutex, atomic::AtomicU64},
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicBool, AtomicU64},
+    },
     time::Duration,
 };
 use tokio::{
@@ -21,7 +24,7 @@ use zenoh::{
     bytes::Encoding,
     pubsub::Subscriber,
     qos::{CongestionControl, Priority},
-    query::{ConsolidationMode, Querier, Reply, ReplyError},
+    query::{ConsolidationMode, Querier, Queryable, Reply, ReplyError},
     sample::Sample,
 };
 
@@ -49,7 +52,10 @@ pub(crate) struct Inner {
     pub(crate) runtime: tokio::runtime::Handle,
     pub(crate) roll: Arc<Roll>,
     pub(crate) goals: AtomicU64,
+    /// Whether this peer has, or is about to have, its presence announced.
+    pub(crate) claims: Arc<AtomicBool>,
     _presence: Subscriber<()>,
+    _roll_call: Queryable<()>,
     lines: Mutex<HashMap<(String, Urgency, u64), Arc<Line>>>,
 }
 
@@ -114,16 +120,21 @@ impl Peer {
             })?;
         let roll = Arc::new(Roll::default());
         let presence = Roll::subscribe(&session, roll.clone()).await?;
+        let name: Arc<str> = config.name.into();
+        let claims = Arc::new(AtomicBool::new(false));
+        let roll_call = answer_roll_call(&session, &name, claims.clone()).await?;
         Ok(Self {
             inner: Arc::new(Inner {
-                name: config.name.into(),
+                name,
                 namespace: namespace.unwrap_or_default(),
                 id: session.zid().to_string(),
                 session,
                 runtime: tokio::runtime::Handle::current(),
                 roll,
                 goals: AtomicU64::new(0),
+                claims,
                 _presence: presence,
+                _roll_call: roll_call,
                 lines: Mutex::default(),
             }),
         })

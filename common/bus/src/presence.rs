@@ -1,21 +1,38 @@
 //! Who is on the network: liveliness tokens `presence/<name>`.
 
-use crate::{BusError, Peer, peer::Inner};
-use std::{collections::BTreeMap, sync::Mutex, time::Duration};
+use crate::{
+    BusError, Peer,
+    exchange::{Desk, asked_format, is_wild},
+    peer::Inner,
+};
+use rover_messages::codec::{self, Format, MAX_PAYLOAD_BYTES};
+use serde::{Deserialize, Serialize};
+use std::{
+    collections::BTreeMap,
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Duration,
+};
 use tokio::{
     sync::{mpsc, watch},
     time::timeout,
 };
 use zenoh::{
     Session,
+    key_expr::KeyExpr,
     liveliness::LivelinessToken,
     pubsub::Subscriber,
+    query::{ConsolidationMode, QueryTarget, Queryable},
     sample::{Sample, SampleKind},
 };
 
 /// Limit for asking the other peers which tokens they hold.
 const TOKEN_LIMIT: Duration = Duration::from_secs(2);
 const PREFIX: &str = "presence/";
+/// Query that every peer answers, each for itself.
+const ROLL_CALL: &str = "roll_call";
 
 #[derive(Clone, Copy, Default)]
 struct Seen {
@@ -33,7 +50,7 @@ pub(crate) struct Roll {
 impl Roll {
     pub(crate) async fn subscribe(
         session: &Session,
-        roll: std::sync::Arc<Self>,
+        roll: Arc<Self>,
     ) -> Result<Subscriber<()>, BusError> {
         session
             .liveliness()
@@ -93,7 +110,29 @@ impl Roll {
 #[derive(Debug)]
 pub struct Presence {
     _token: LivelinessToken,
+    _claim: Claim,
 }
+
+/// A peer's claim to its name; given back on drop.
+#[derive(Debug)]
+struct Claim(Arc<AtomicBool>);
+
+impl Drop for Claim {
+    fn drop(&mut self) {
+        self.0.store(false, Ordering::SeqCst);
+    }
+}
+
+/// Every peer's answer on [`ROLL_CALL`].
+#[derive(Serialize, Deserialize)]
+pub(crate) struct Present {
+    name: String,
+    /// Zenoh's identity of the session.
+    id: String,
+    /// Whether it has, or is about to have, its presence announced.
+    claims: bool,
+}
+rover_messages::wire! { Present = "present/1" }
 
 /// Changes of presence, in order, beginning with everybody who is present already.
 #[derive(Debug)]
@@ -108,7 +147,66 @@ impl PresenceWatcher {
     }
 }
 
+/// Serves the roll call for the session of `desk`.
+pub(crate) async fn answer_roll_call(
+    session: &Session,
+    name: &Arc<str>,
+    claims: Arc<AtomicBool>,
+) -> Result<Queryable<()>, BusError> {
+    let error = |e| BusError::network(format!("serving {ROLL_CALL}"), e);
+    let key = KeyExpr::try_from(ROLL_CALL).map_err(error)?;
+    let desk = Desk {
+        name: name.clone(),
+        key,
+    };
+    let id = session.zid().to_string();
+    session
+        .declare_queryable(ROLL_CALL)
+        .callback(move |query| {
+            if !is_wild(&query, &desk.key) {
+                let claims = claims.load(Ordering::SeqCst);
+                let present = Present {
+                    name: desk.name.to_string(),
+                    id: id.clone(),
+                    claims,
+                };
+                desk.answer(&query, &present, asked_format(&query));
+            }
+        })
+        .await
+        .map_err(error)
+}
+
 impl Inner {
+    /// Whether another peer claims this peer's name; every peer is asked.
+    async fn has_rival(&self) -> Result<bool, BusError> {
+        let (tell, mut told) = mpsc::unbounded_channel();
+        self.session
+            .get(ROLL_CALL)
+            .target(QueryTarget::All)
+            .consolidation(ConsolidationMode::None)
+            .timeout(TOKEN_LIMIT)
+            .callback(move |reply| {
+                if let Ok(sample) = reply.result() {
+                    let _ = tell.send(sample.payload().to_bytes().into_owned());
+                }
+            })
+            .await
+            .map_err(|e| BusError::network(ROLL_CALL, e))?;
+        let mut rival = false;
+        while let Some(bytes) = told.recv().await {
+            let present: Present =
+                codec::decode(&bytes, Format::Json, MAX_PAYLOAD_BYTES).map_err(|error| {
+                    BusError::Decode {
+                        key: ROLL_CALL.to_owned(),
+                        error,
+                    }
+                })?;
+            rival |= present.claims && *present.name == *self.name && present.id != self.id;
+        }
+        Ok(rival)
+    }
+
     /// Whether any token matches; asks the other peers.
     async fn tokens(&self, key: &str) -> Result<Vec<String>, BusError> {
         let error = |e| BusError::network(format!("tokens on {key}"), e);
@@ -147,33 +245,26 @@ impl Peer {
     /// none.
     pub async fn announce(&self) -> Result<Presence, BusError> {
         let inner = &self.inner;
-        let error = |e| BusError::network(format!("announcing `{}`", inner.name), e);
-        // Both candidates raise a flag before they look; so at least one sees the other.
-        let flags = format!("candidate/{}", inner.name);
-        let own = format!("{flags}/{}", inner.id);
-        let flag = inner
-            .session
-            .liveliness()
-            .declare_token(&own)
-            .await
-            .map_err(error)?;
-        let rivals = inner.tokens(&format!("{flags}/*")).await?;
-        let token_key = format!("{PREFIX}{}", inner.name);
-        let present = !inner.tokens(&token_key).await?.is_empty();
-        if present || rivals.iter().any(|key| *key != own) {
-            return Err(BusError::AlreadyPresent {
-                name: inner.name.to_string(),
-                namespace: inner.namespace.clone(),
-            });
+        let refused = || BusError::AlreadyPresent {
+            name: inner.name.to_string(),
+            namespace: inner.namespace.clone(),
+        };
+        // Claim first, then ask: of two that claim at once, whoever asks later hears the other.
+        if inner.claims.swap(true, Ordering::SeqCst) {
+            return Err(refused());
         }
-        let token = inner
-            .session
-            .liveliness()
-            .declare_token(token_key)
-            .await
-            .map_err(error)?;
-        flag.undeclare().await.map_err(error)?;
-        Ok(Presence { _token: token })
+        let claim = Claim(inner.claims.clone());
+        let key = format!("{PREFIX}{}", inner.name);
+        if inner.has_rival().await? || !inner.tokens(&key).await?.is_empty() {
+            return Err(refused());
+        }
+        let token = inner.session.liveliness().declare_token(key).await;
+        let token =
+            token.map_err(|e| BusError::network(format!("announcing `{}`", inner.name), e))?;
+        Ok(Presence {
+            _token: token,
+            _claim: claim,
+        })
     }
 
     /// Waits until all `names` are present.

@@ -112,6 +112,12 @@ fn beyond_domain<const N: usize>(angles: &[f64; N], count: usize) -> ([f64; N], 
     (sines, cosines)
 }
 
+/// The integer nearest to `x`, even ones for halves; `x` below 2^50 in magnitude.
+#[inline]
+pub(crate) fn nearest(x: f64) -> f64 {
+    (x + ROUNDER) - ROUNDER
+}
+
 /// `atan(k / 16)`.
 const ARC: [f64; 17] = [
     0.0,
@@ -144,7 +150,7 @@ pub(crate) fn atan2(y: f64, x: f64) -> f64 {
         return 0.0;
     }
     // The nearest sixteenth of the slope, and the tangent of what is left.
-    let slope = (16.0 * (low / high) + ROUNDER) - ROUNDER;
+    let slope = nearest(16.0 * (low / high));
     let step = slope * 0.0625;
     let t = (low - step * high) / (high + step * low);
     let z = t * t;

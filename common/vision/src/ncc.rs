@@ -62,7 +62,38 @@ pub struct Template {
     spans: Vec<Span>,
     rectangular: bool,
     count: usize,
+    /// Mean of `values` inside the mask.
+    mean: f64,
     norm: f64,
+}
+
+/// Rounds half up; the argument is within +-4097.
+#[inline(always)]
+fn round_to_i16(x: f32) -> i16 {
+    ((x + 8192.5) as i32 - 8192) as i16
+}
+
+/// The runs of `true` in each row.
+fn spans_of(mask: &[bool], width: usize) -> Vec<Span> {
+    let mut spans = Vec::new();
+    for (row, line) in mask.chunks_exact(width).enumerate() {
+        let mut start = None;
+        for (column, &on) in line.iter().chain(std::iter::once(&false)).enumerate() {
+            match (on, start) {
+                (true, None) => start = Some(column),
+                (false, Some(first)) => {
+                    spans.push(Span {
+                        row,
+                        start: first,
+                        end: column,
+                    });
+                    start = None;
+                }
+                _ => {}
+            }
+        }
+    }
+    spans
 }
 
 /// Most pixels in a template.
@@ -94,65 +125,63 @@ impl Template {
             return Err(wrong(mask.len()));
         }
         let inside = |i: usize| mask.is_none_or(|m| m[i]);
-        let chosen: Vec<f64> = (0..values.len())
-            .filter(|&i| inside(i))
-            .map(|i| f64::from(values[i]))
-            .collect();
-        let count = chosen.len();
+        let count = mask.map_or(values.len(), |m| m.iter().filter(|&&on| on).count());
         if !(2..=MAX_COUNT).contains(&count) {
             return Err(TemplateError::BadCount {
                 found: count,
                 limit: MAX_COUNT,
             });
         }
-        let mean = chosen.iter().sum::<f64>() / count as f64;
-        let largest = chosen.iter().map(|x| (x - mean).abs()).fold(0.0, f64::max);
-        let deviation =
-            (chosen.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / count as f64).sqrt();
+        let chosen = || {
+            values
+                .iter()
+                .enumerate()
+                .filter(|&(i, _)| inside(i))
+                .map(|(_, &x)| x)
+        };
+        let n = count as f64;
+        let mean = chosen().map(f64::from).sum::<f64>() / n;
+        let (mut largest, mut size_sum, mut square_sum) = (0.0f64, 0.0f64, 0.0f64);
+        for x in chosen() {
+            let d = f64::from(x) - mean;
+            largest = largest.max(d.abs());
+            size_sum += d.abs();
+            square_sum += d * d;
+        }
+        let deviation = (square_sum / n).sqrt();
         if !deviation.is_finite() || deviation <= 1e-6 * (1.0 + mean.abs()) {
             return Err(TemplateError::NoContrast(deviation));
         }
         // |sum of products| must stay below 2^31 for any image
-        let size_sum: f64 = chosen.iter().map(|x| (x - mean).abs()).sum();
-        let gain = (4096.0 / largest).min(2.0e6 / size_sum);
+        let gain = (4096.0 / largest).min(2.0e6 / size_sum) as f32;
 
         let stride = width.div_ceil(LANES) * LANES;
         let mut quantised = vec![0i16; stride * height];
-        for i in (0..values.len()).filter(|&i| inside(i)) {
-            let x = (f64::from(values[i]) - mean) * gain;
-            quantised[(i / width) * stride + i % width] = x.round() as i16;
-        }
-        let mut spans = Vec::new();
-        for row in 0..height {
-            let mut start = None;
-            for column in 0..=width {
-                let on = column < width && inside(row * width + column);
-                match (on, start) {
-                    (true, None) => start = Some(column),
-                    (false, Some(first)) => {
-                        spans.push(Span {
-                            row,
-                            start: first,
-                            end: column,
-                        });
-                        start = None;
-                    }
-                    _ => {}
+        let (mut sum, mut square) = (0i64, 0i64);
+        let lines = quantised
+            .chunks_exact_mut(stride)
+            .zip(values.chunks_exact(width));
+        for (row, (out, line)) in lines.enumerate() {
+            for (column, (o, &x)) in out.iter_mut().zip(line).enumerate() {
+                if inside(row * width + column) {
+                    let q = round_to_i16((x - mean as f32) * gain);
+                    *o = q;
+                    sum += i64::from(q);
+                    square += i64::from(i32::from(q) * i32::from(q));
                 }
             }
         }
-        // Rounding leaves a mean of less than half a unit; the score uses sums that ignore it.
-        let sum: i64 = quantised.iter().map(|&x| i64::from(x)).sum();
-        let square: i64 = quantised.iter().map(|&x| i64::from(x).pow(2)).sum();
-        let norm = (square as f64 - (sum as f64).powi(2) / count as f64).sqrt();
+        // Rounding leaves a small mean; the score takes it into account.
+        let norm = (square as f64 - (sum as f64).powi(2) / n).sqrt();
         Ok(Self {
             width,
             height,
             stride,
             values: quantised,
+            spans: mask.map_or_else(Vec::new, |m| spans_of(m, width)),
             rectangular: count == width * height,
-            spans,
             count,
+            mean: sum as f64 / n,
             norm,
         })
     }
@@ -300,46 +329,122 @@ fn add_groups<const N: usize>(sums: &mut [u16], row: &[u8]) {
     }
 }
 
-/// Dot product of rows whose length is a multiple of [`LANES`].
-#[cfg(target_arch = "x86_64")]
-#[inline(always)]
-fn dot_rows(template: &Template, image: &SearchImage, x: usize, y: usize) -> i32 {
-    use std::arch::x86_64::{
-        __m128i, _mm_add_epi32, _mm_loadu_si128, _mm_madd_epi16, _mm_setzero_si128,
-        _mm_storeu_si128,
-    };
-    let mut lanes = [0i32; 4];
-    // SAFETY: SSE2 belongs to every x86-64; each load reads 8 i16 from a slice of exactly 8, the
-    // store writes 4 i32 to an array of 4.
-    unsafe {
-        let mut sum = _mm_setzero_si128();
-        for (row, line) in template.values.chunks_exact(template.stride).enumerate() {
-            let other = &image.row(y + row)[x..x + template.stride];
-            for (a, b) in line.chunks_exact(LANES).zip(other.chunks_exact(LANES)) {
-                let a = _mm_loadu_si128(a.as_ptr().cast::<__m128i>());
-                let b = _mm_loadu_si128(b.as_ptr().cast::<__m128i>());
-                sum = _mm_add_epi32(sum, _mm_madd_epi16(a, b));
-            }
-        }
-        _mm_storeu_si128(lanes.as_mut_ptr().cast::<__m128i>(), sum);
+/// Sums of products of the template with the image at positions `x..x + out.len()` of row `y`.
+///
+/// The caller guarantees that the template lies inside the image at all of them; rows are padded so
+/// that whole vectors can be read.
+fn dots(template: &Template, image: &SearchImage, x: usize, y: usize, out: &mut [i32]) {
+    if out.is_empty() {
+        return;
     }
-    lanes[0]
-        .wrapping_add(lanes[1])
-        .wrapping_add(lanes[2])
-        .wrapping_add(lanes[3])
+    let last_row = (y + template.height - 1) * image.stride;
+    assert!(
+        last_row + x + out.len() - 1 + template.stride <= image.values.len()
+            && template.values.len() == template.stride * template.height,
+        "a template position reads beyond the search image"
+    );
+    let start = y * image.stride + x;
+    #[cfg(target_arch = "x86_64")]
+    {
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: AVX2 is there, and the assertion covers every read.
+            unsafe { dots_avx2(template, image, start, out) };
+        } else {
+            // SAFETY: SSE2 belongs to every x86-64, and the assertion covers every read.
+            unsafe { dots_sse2(template, image, start, out) };
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    dots_plain(template, image, start, out);
 }
 
-/// Dot product of rows whose length is a multiple of [`LANES`].
-#[cfg(not(target_arch = "x86_64"))]
-fn dot_rows(template: &Template, image: &SearchImage, x: usize, y: usize) -> i32 {
-    let mut sum = 0i32;
-    for (row, line) in template.values.chunks_exact(template.stride).enumerate() {
-        let other = &image.row(y + row)[x..x + template.stride];
-        for (&a, &b) in line.iter().zip(other) {
-            sum = sum.wrapping_add(i32::from(a) * i32::from(b));
+/// The same without vector instructions.
+#[cfg(any(test, not(target_arch = "x86_64")))]
+fn dots_plain(template: &Template, image: &SearchImage, start: usize, out: &mut [i32]) {
+    for (i, o) in out.iter_mut().enumerate() {
+        *o = 0;
+        for (row, line) in template.values.chunks_exact(template.stride).enumerate() {
+            let other = &image.values[start + i + row * image.stride..];
+            for (&a, &b) in line.iter().zip(other) {
+                *o = o.wrapping_add(i32::from(a) * i32::from(b));
+            }
         }
     }
-    sum
+}
+
+/// # Safety
+/// For every position `start + i` and every template row, `template.stride` values must follow.
+#[cfg(target_arch = "x86_64")]
+unsafe fn dots_sse2(template: &Template, image: &SearchImage, start: usize, out: &mut [i32]) {
+    use std::arch::x86_64::{
+        __m128i, _mm_add_epi32, _mm_cvtsi128_si32, _mm_loadu_si128, _mm_madd_epi16,
+        _mm_setzero_si128, _mm_shuffle_epi32,
+    };
+    for (i, o) in out.iter_mut().enumerate() {
+        // SAFETY: as the caller guarantees.
+        unsafe {
+            let mut sum = _mm_setzero_si128();
+            let mut a = template.values.as_ptr();
+            let mut line = image.values.as_ptr().add(start + i);
+            for _ in 0..template.height {
+                for k in (0..template.stride).step_by(8) {
+                    let t = _mm_loadu_si128(a.add(k).cast::<__m128i>());
+                    let p = _mm_loadu_si128(line.add(k).cast::<__m128i>());
+                    sum = _mm_add_epi32(sum, _mm_madd_epi16(t, p));
+                }
+                a = a.wrapping_add(template.stride);
+                line = line.wrapping_add(image.stride);
+            }
+            sum = _mm_add_epi32(sum, _mm_shuffle_epi32(sum, 0b01_00_11_10));
+            sum = _mm_add_epi32(sum, _mm_shuffle_epi32(sum, 0b10_11_00_01));
+            *o = _mm_cvtsi128_si32(sum);
+        }
+    }
+}
+
+/// # Safety
+/// The processor must have AVX2; for every position `start + i` and every template row,
+/// `template.stride` values must follow.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+unsafe fn dots_avx2(template: &Template, image: &SearchImage, start: usize, out: &mut [i32]) {
+    use std::arch::x86_64::{
+        __m128i, __m256i, _mm_add_epi32, _mm_cvtsi128_si32, _mm_loadu_si128, _mm_madd_epi16,
+        _mm_setzero_si128, _mm_shuffle_epi32, _mm256_add_epi32, _mm256_castsi256_si128,
+        _mm256_extracti128_si256, _mm256_loadu_si256, _mm256_madd_epi16, _mm256_setzero_si256,
+    };
+    let (wide, odd) = (template.stride / 16 * 16, template.stride % 16 != 0);
+    for (i, o) in out.iter_mut().enumerate() {
+        // SAFETY: as the caller guarantees.
+        unsafe {
+            let mut sum = _mm256_setzero_si256();
+            let mut rest = _mm_setzero_si128();
+            let mut a = template.values.as_ptr();
+            let mut line = image.values.as_ptr().add(start + i);
+            for _ in 0..template.height {
+                for k in (0..wide).step_by(16) {
+                    let t = _mm256_loadu_si256(a.add(k).cast::<__m256i>());
+                    let p = _mm256_loadu_si256(line.add(k).cast::<__m256i>());
+                    sum = _mm256_add_epi32(sum, _mm256_madd_epi16(t, p));
+                }
+                if odd {
+                    let t = _mm_loadu_si128(a.add(wide).cast::<__m128i>());
+                    let p = _mm_loadu_si128(line.add(wide).cast::<__m128i>());
+                    rest = _mm_add_epi32(rest, _mm_madd_epi16(t, p));
+                }
+                a = a.wrapping_add(template.stride);
+                line = line.wrapping_add(image.stride);
+            }
+            let halves = _mm_add_epi32(
+                _mm256_castsi256_si128(sum),
+                _mm256_extracti128_si256(sum, 1),
+            );
+            let mut sum = _mm_add_epi32(halves, rest);
+            sum = _mm_add_epi32(sum, _mm_shuffle_epi32(sum, 0b01_00_11_10));
+            sum = _mm_add_epi32(sum, _mm_shuffle_epi32(sum, 0b10_11_00_01));
+            *o = _mm_cvtsi128_si32(sum);
+        }
+    }
 }
 
 /// Scores for template positions: the template's first pixel at column `left + i`, row `top + j`
@@ -572,9 +677,9 @@ pub fn score_map(
     let prefix = columns_state
         .is_none()
         .then(|| RowPrefix::new(image, left, covered_columns, top, covered_rows));
-    let flat = n * (FLAT_DN * f64::from(SCALE)).powi(2);
+    let flat = (n * (FLAT_DN * f64::from(SCALE)).powi(2)) as f32;
     let inverse_norm = 1.0 / template.norm;
-    let mean_correction = template.values.iter().map(|&x| f64::from(x)).sum::<f64>() / n;
+    let mut products = vec![0i32; width];
     for y in top..top + height {
         if let Some(state) = &mut columns_state {
             if y > top {
@@ -587,16 +692,24 @@ pub fn score_map(
         if let Some(prefix) = &prefix {
             prefix.windows(template, y, &mut windows);
         }
-        for (i, (&sum, &square)) in windows.sums.iter().zip(&windows.squares).enumerate() {
-            let sum = sum as f64;
-            let variance = square as f64 - sum * sum / n;
-            scores.push(if variance <= flat {
-                0.0
-            } else {
-                let product = f64::from(dot_rows(template, image, left + i, y));
-                ((product - mean_correction * sum) * inverse_norm / variance.sqrt()) as f32
-            });
-        }
+        dots(template, image, left, y, &mut products);
+        let sums = windows.sums.iter().zip(&windows.squares);
+        scores.extend(
+            products
+                .iter()
+                .zip(sums)
+                .map(|(&product, (&sum, &square))| {
+                    let sum = sum as f64;
+                    let variance = (square as f64 - sum * sum / n) as f32;
+                    let covariance =
+                        ((f64::from(product) - template.mean * sum) * inverse_norm) as f32;
+                    if variance <= flat {
+                        0.0
+                    } else {
+                        covariance / variance.sqrt()
+                    }
+                }),
+        );
     }
     Some(ScoreMap {
         left,
@@ -947,6 +1060,29 @@ mod tests {
         let flat = Image8::from_raw(64, 64, vec![90; 64 * 64]).unwrap();
         let map = score_map(&SearchImage::whole(&flat, 0), &template, 0, 0, 64, 64).unwrap();
         assert!(map.scores.iter().all(|&s| s == 0.0));
+    }
+
+    #[test]
+    fn vector_units_give_the_same_sums() {
+        let image = SearchImage::whole(&noise(90, 60, 6), 0);
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        for width in [3usize, 8, 13, 16, 20, 31, 40] {
+            let values: Vec<f32> = (0..width * 11)
+                .map(|_| rng.random_range(0.0..9.0))
+                .collect();
+            let template = Template::new(width, 11, &values, None).unwrap();
+            let count = image.width() + 1 - width;
+            let (mut fast, mut plain) = (vec![0; count], vec![0; count]);
+            dots(&template, &image, 0, 5, &mut fast);
+            dots_plain(&template, &image, 5 * image.stride, &mut plain);
+            assert_eq!(fast, plain);
+            #[cfg(target_arch = "x86_64")]
+            {
+                // SAFETY: `dots` has just checked the same positions.
+                unsafe { dots_sse2(&template, &image, 5 * image.stride, &mut fast) };
+                assert_eq!(fast, plain);
+            }
+        }
     }
 
     #[test]

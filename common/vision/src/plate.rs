@@ -239,44 +239,42 @@ impl PlateLayout {
     }
 
     fn check_gaps(&self) -> Result<(), LayoutError> {
-        let apart = |first: String, second: String, gap_m: f64| {
-            if gap_m > 0.0 {
-                Ok(())
+        let name = |i: usize| {
+            if i < self.discs.len() {
+                format!("discs[{i}]")
             } else {
-                Err(LayoutError::Overlap {
-                    first,
-                    second,
-                    gap_m,
-                })
+                "the saddle".into()
             }
+        };
+        let apart = |i: usize, other: Option<usize>, gap_m: f64| {
+            if gap_m > 0.0 {
+                return Ok(());
+            }
+            let second = other.map_or_else(|| "the edge".into(), name);
+            Err(LayoutError::Overlap {
+                first: name(i),
+                second,
+                gap_m,
+            })
         };
         let to_edge = |x: f64, y: f64, reach: f64| {
             (self.half_width_m - x.abs()).min(self.half_height_m - y.abs()) - reach
         };
+        let last = self.discs.len();
         for (i, d) in self.discs.iter().enumerate() {
-            let name = format!("discs[{i}]");
-            apart(
-                name.clone(),
-                "the edge".into(),
-                to_edge(d.x_m, d.y_m, d.radius_m),
-            )?;
+            apart(i, None, to_edge(d.x_m, d.y_m, d.radius_m))?;
             for (j, other) in self.discs.iter().enumerate().skip(i + 1) {
                 let distance = (d.x_m - other.x_m).hypot(d.y_m - other.y_m);
-                let gap = distance - d.radius_m - other.radius_m;
-                apart(name.clone(), format!("discs[{j}]"), gap)?;
+                apart(i, Some(j), distance - d.radius_m - other.radius_m)?;
             }
             if let Some(s) = &self.saddle {
                 let dx = ((d.x_m - s.x_m).abs() - s.half_size_m).max(0.0);
                 let dy = ((d.y_m - s.y_m).abs() - s.half_size_m).max(0.0);
-                apart(name, "the saddle".into(), dx.hypot(dy) - d.radius_m)?;
+                apart(i, Some(last), dx.hypot(dy) - d.radius_m)?;
             }
         }
         if let Some(s) = &self.saddle {
-            apart(
-                "the saddle".into(),
-                "the edge".into(),
-                to_edge(s.x_m, s.y_m, s.half_size_m),
-            )?;
+            apart(last, None, to_edge(s.x_m, s.y_m, s.half_size_m))?;
         }
         Ok(())
     }

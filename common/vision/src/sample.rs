@@ -50,6 +50,13 @@ pub fn bilinear(image: &ImageF, u: f64, v: f64) -> Option<Sample> {
     })
 }
 
+/// The largest whole number not above `x`, or one more if `x` is within 1e-4 below it (the spline's
+/// polynomials join smoothly there), for |x| below 1024.
+#[inline(always)]
+fn near_floor(x: f32) -> i32 {
+    (x + 1024.0) as i32 - 1024
+}
+
 /// Weights of Keys' kernel (a = -1/2) for the pixels at -1, 0, 1, 2 and their derivatives.
 fn keys_weights(t: f32) -> ([f32; 4], [f32; 4]) {
     let (t2, t3) = (t * t, t * t * t);
@@ -198,17 +205,21 @@ impl SplineImage {
         }
         let width = self.width();
         let values = self.coefficients.values();
-        let (max_u, max_v) = (width - 3, self.height() - 3);
+        let (max_u, max_v) = (width as i32 - 3, self.height() as i32 - 3);
+        // relative to the first sample's pixel, so that single precision holds 1e-5 px
+        let base = [origin[0].floor(), origin[1].floor()];
+        let (base_u, base_v) = (base[0] as i32, base[1] as i32);
+        let (su, sv) = (step_u[0] as f32, step_u[1] as f32);
         for (j, line) in out.chunks_exact_mut(columns).take(rows).enumerate() {
-            let u0 = origin[0] + j as f64 * step_v[0];
-            let v0 = origin[1] + j as f64 * step_v[1];
+            let u0 = (origin[0] - base[0] + j as f64 * step_v[0]) as f32;
+            let v0 = (origin[1] - base[1] + j as f64 * step_v[1]) as f32;
             for (i, o) in line.iter_mut().enumerate() {
-                let u = u0 + i as f64 * step_u[0];
-                let v = v0 + i as f64 * step_u[1];
-                let (iu, iv) = ((u as usize).clamp(1, max_u), (v as usize).clamp(1, max_v));
-                let wu = spline_weights((u - iu as f64) as f32);
-                let wv = spline_weights((v - iv as f64) as f32);
-                let start = (iv - 1) * width + iu - 1;
+                let (u, v) = (u0 + i as f32 * su, v0 + i as f32 * sv);
+                let iu = (near_floor(u) + base_u).clamp(1, max_u);
+                let iv = (near_floor(v) + base_v).clamp(1, max_v);
+                let wu = spline_weights(u - (iu - base_u) as f32);
+                let wv = spline_weights(v - (iv - base_v) as f32);
+                let start = (iv as usize - 1) * width + iu as usize - 1;
                 let mut columns4 = [0.0f32; 4];
                 for (k, weight) in wv.iter().enumerate() {
                     let row = &values[start + k * width..start + k * width + 4];
@@ -223,23 +234,19 @@ impl SplineImage {
         true
     }
 
-    /// Gradient exactly at pixel (`iu`, `iv`), which must be at least one pixel inside.
-    #[inline]
-    pub(crate) fn gradient_at_pixel(&self, iu: usize, iv: usize) -> [f32; 2] {
-        let width = self.width();
-        let values = self.coefficients.values();
+    /// Gradients exactly at the pixels (`iu`..) of row `iv`, all at least one pixel inside.
+    pub(crate) fn gradient_row(&self, iu: usize, iv: usize, du: &mut [f32], dv: &mut [f32]) {
+        let (width, n) = (self.width(), du.len());
         let start = (iv - 1) * width + iu - 1;
-        let (a, b, c) = (
-            &values[start..start + 3],
-            &values[start + width..start + width + 3],
-            &values[start + 2 * width..start + 2 * width + 3],
-        );
+        let values = self.coefficients.values();
+        let line = |k: usize| &values[start + k * width..start + k * width + n + 2];
+        let (a, b, c) = (line(0), line(1), line(2));
         const E: f32 = 1.0 / 12.0;
         const M: f32 = 4.0 / 12.0;
-        [
-            E * ((a[2] - a[0]) + (c[2] - c[0])) + M * (b[2] - b[0]),
-            E * ((c[0] - a[0]) + (c[2] - a[2])) + M * (c[1] - a[1]),
-        ]
+        for (i, (du, dv)) in du.iter_mut().zip(dv).enumerate() {
+            *du = E * ((a[i + 2] - a[i]) + (c[i + 2] - c[i])) + M * (b[i + 2] - b[i]);
+            *dv = E * ((c[i] - a[i]) + (c[i + 2] - a[i + 2])) + M * (c[i + 1] - a[i + 1]);
+        }
     }
 }
 
@@ -306,7 +313,9 @@ mod tests {
             if u > 8 && v > 8 && u < 31 && v < 21 {
                 assert!((s.value - exact).abs() < 2e-3, "{} {exact}", s.value);
             }
-            let g = spline.gradient_at_pixel(u, v);
+            let (mut du, mut dv) = ([0.0; 1], [0.0; 1]);
+            spline.gradient_row(u, v, &mut du, &mut dv);
+            let g = [du[0], dv[0]];
             assert!((g[0] - s.du).abs() < 1e-3 && (g[1] - s.dv).abs() < 1e-3);
             assert_eq!(bilinear(&image, u as f64, v as f64).unwrap().value, exact);
             assert!((bicubic(&image, u as f64, v as f64).unwrap().value - exact).abs() < 1e-4);

@@ -3,3 +3,5 @@
 
 mod physics;
 mod support;
+mod truth;
+mod world;

@@ -1,10 +1,19 @@
-//! An arm and a floor for tests of the physics alone.
+//! Arms, floors and worlds for the tests.
 
-use crate::{arm::ArmModel, description::ContactDescription};
-use nalgebra::{Isometry3, UnitQuaternion, Vector3};
-use rover_kinematics::{Arm, DhRow, JointLimits};
-use rover_robot::{Capsule, ContactSwitch, LinkDynamics};
-use std::f64::consts::{FRAC_PI_2, PI};
+use crate::{
+    ContactDescription, RockDescription, ScatteredRocks, SimulationDescription, SurfacePoint,
+    TargetPixel, TerrainDescription, TruthDescription, arm::ArmModel,
+};
+use nalgebra::{Isometry3, Point3, Unit, UnitQuaternion, Vector3};
+use rover_kinematics::{
+    Arm, AxisGoal, DhRow, JointLimits, JointTrajectory, TimingOptions, closest_solution,
+    through_with,
+};
+use rover_robot::{Capsule, ContactSwitch, LinkDynamics, Robot};
+use std::{
+    f64::consts::{FRAC_PI_2, PI},
+    sync::Arc,
+};
 
 /// The arm of the Mars Exploration Rover with its z axis down, 0.6 m above the ground.
 pub fn arm_model() -> ArmModel {
@@ -118,4 +127,82 @@ pub fn floor(z_m: f64, n: u32) -> (Vec<Vector3<f64>>, Vec<[u32; 3]>) {
         }
     }
     (positions, triangles)
+}
+
+/// The testbed robot.
+pub fn robot() -> Arc<Robot> {
+    let text = include_str!("../../../scenarios/robots/bluestreak.toml");
+    Arc::new(Robot::parse(text, "bluestreak.toml").unwrap())
+}
+
+/// A coarse table with one rock in the arm's workspace, the pixel on the rock's top as target, an
+/// exact robot without droop.
+pub fn scene() -> SimulationDescription {
+    SimulationDescription {
+        truth: TruthDescription {
+            droop: false,
+            ..TruthDescription::default()
+        },
+        terrain: TerrainDescription {
+            centre_m: [0.75, 0.0],
+            size_m: [1.2, 1.2],
+            height_m: 0.25,
+            cell_m: 0.02,
+            relief_m: 0.004,
+            rocks: vec![RockDescription {
+                position_m: [0.54, 0.0, 0.27],
+                radius_m: 0.13,
+                roughness: 0.06,
+                subdivisions_n: 5,
+                seed: 7,
+            }],
+            scattered: ScatteredRocks {
+                count_n: 3,
+                ..ScatteredRocks::default()
+            },
+            ..TerrainDescription::default()
+        },
+        target: Some(TargetPixel {
+            pair: "body".into(),
+            pixel_px: [340.0, 236.0],
+        }),
+        ..SimulationDescription::default()
+    }
+}
+
+/// Joint angles that put the believed tip at `point` with the axis along `axis` (rover frame).
+pub fn reach(robot: &Robot, point: &Vector3<f64>, axis: &Vector3<f64>, near: &[f64]) -> Vec<f64> {
+    let base_from_rover = robot.rover_from_arm_base.isometry.inverse();
+    let goal = AxisGoal {
+        point: (base_from_rover * Point3::from(*point)).coords,
+        axis: Unit::new_normalize(base_from_rover.rotation * axis),
+    };
+    closest_solution(&robot.arm, &robot.tool, &goal, near).unwrap()
+}
+
+/// A straight motion of the tip along its axis, from `from_m` to `to_m` above `surface`, at
+/// `speed_m_s`.
+pub fn straight(
+    robot: &Robot,
+    surface: &SurfacePoint,
+    [from_m, to_m]: [f64; 2],
+    speed_m_s: f64,
+) -> JointTrajectory {
+    let axis = -surface.normal.into_inner();
+    let knots = 60;
+    let mut near = robot.posture("ready").unwrap().to_vec();
+    let path: Vec<Vec<f64>> = (0..=knots)
+        .map(|i| {
+            let above = from_m + (to_m - from_m) * f64::from(i) / f64::from(knots);
+            near = reach(robot, &(surface.point_m - axis * above), &axis, &near);
+            near.clone()
+        })
+        .collect();
+    let lengths = vec![(from_m - to_m).abs() / f64::from(knots); knots as usize];
+    let options = TimingOptions {
+        max_tool_speed_m_s: Some(speed_m_s),
+        path_lengths_m: Some(lengths),
+        ..TimingOptions::default()
+    };
+    through_with(&robot.arm, &path, &options).unwrap()
 }

@@ -19,8 +19,8 @@ use std::{
 
 /// Wall-clock limit for the arm's state.
 const STATE_LIMIT: Duration = Duration::from_secs(30);
-/// Spacing of the pixels that a survey matches: about a map cell at the ranges of an arm.
-const SURVEY_STEP_PX: u32 = 6;
+/// Spacing of the pixels that a survey matches: one to two map cells at the ranges of an arm.
+const SURVEY_STEP_PX: u32 = 10;
 
 /// Starts the service on `peer`; it lives as long as the returned value.
 ///
@@ -125,6 +125,8 @@ fn mapped(
     let rules = MatchRules {
         range_min_m: pair.range_min_m,
         range_max_m: pair.range_max_m,
+        // Ground and what faces the cameras; a map of centimetres needs no other slants.
+        slant_normals: vec![[0.0, 0.0, 1.0]],
         ..Default::default()
     };
     let found = sparse_points(&left, &right, &frame.cameras, SURVEY_STEP_PX, &rules)

@@ -383,14 +383,16 @@ impl<'a> Solver<'a> {
                         continue;
                     }
                 };
-                for elbow in [Elbow::Positive, Elbow::Negative] {
-                    let branch = Branch {
-                        shoulder,
-                        wrist,
-                        elbow,
-                    };
-                    let posture = self.posture(&side, &hand, &plane, elbow);
-                    let theta = match self.polish(&posture, branch) {
+                let elbows = [Elbow::Positive, Elbow::Negative];
+                let branches = elbows.map(|elbow| Branch {
+                    shoulder,
+                    wrist,
+                    elbow,
+                });
+                let postures = elbows.map(|elbow| self.posture(&side, &hand, &plane, elbow));
+                let polished = self.polish(&postures, &branches);
+                for ((posture, branch), theta) in postures.iter().zip(branches).zip(polished) {
+                    let theta = match theta {
                         Ok(theta) => theta,
                         Err(by_m) => {
                             fails((posture.nearest_edge(), by_m));

@@ -35,103 +35,154 @@ fn smallest_mark_m(search: &PlateSearch, part: Part) -> f64 {
     }
 }
 
-/// Finds the places that look most like the searched part, best first, aligned at full resolution.
-pub(super) fn coarse(
+/// The part of the image to search, and at which resolution.
+struct Field<'a> {
+    search: &'a PlateSearch<'a>,
+    part: Part,
+    window: SearchImage,
+    /// First pixel of the window in the image.
+    corner: Vector2<f64>,
+    level: u32,
+    /// Shorter side of the part's image, px.
+    side: f64,
+}
+
+impl<'a> Field<'a> {
+    fn new(
+        image: &Image8,
+        search: &'a PlateSearch,
+        map: &LocalMap,
+        part: Part,
+    ) -> Result<Self, NotFound> {
+        let needed_px = search.rules.min_mark_radius_px;
+        let mark_px = smallest_mark_m(search, part) * map.scales().0;
+        if !(mark_px >= needed_px) {
+            return Err(NotFound::TooSmall {
+                found_px: mark_px,
+                needed_px,
+            });
+        }
+        let (low, high) = model::bounds(search.layout, part, map);
+        let side = (high.x - low.x).min(high.y - low.y);
+        let mut level = 0;
+        while level < MAX_LEVEL
+            && side / f64::from(2u32 << level) >= MIN_COARSE_SIDE
+            && mark_px / f64::from(2u32 << level) >= MIN_COARSE_MARK
+        {
+            level += 1;
+        }
+        // the widest hypothesis must fit
+        let step = f64::from(1u32 << level);
+        let room = search.search_radius_px + 0.15 * (high - low).max() + 2.0 * step;
+        let clamp = |x: f64, size: u32| x.clamp(0.0, f64::from(size)) as u32;
+        let left = clamp((low.x - room).floor(), image.width_px);
+        let top = clamp((low.y - room).floor(), image.height_px);
+        let right = clamp((high.x + room).ceil() + 1.0, image.width_px);
+        let bottom = clamp((high.y + room).ceil() + 1.0, image.height_px);
+        if right <= left || bottom <= top {
+            return Err(outside(search, map));
+        }
+        Ok(Self {
+            search,
+            part,
+            window: SearchImage::new(image, left, top, right - left, bottom - top, level),
+            corner: Vector2::new(f64::from(left), f64::from(top)),
+            level,
+            side,
+        })
+    }
+
+    /// Drops places close to better ones.
+    fn distinct(&self, mut places: Vec<Candidate>) -> Vec<Candidate> {
+        places.sort_by(|a, b| b.score.total_cmp(&a.score));
+        let mut kept: Vec<Candidate> = Vec::new();
+        for place in places {
+            let close = |c: &Candidate| {
+                (c.map.pixel_px - place.map.pixel_px).norm() < SAME_PLACE * self.side
+            };
+            if !kept.iter().any(close) {
+                kept.push(place);
+            }
+        }
+        kept
+    }
+}
+
+/// Places closer than this fraction of the part's side are one.
+const SAME_PLACE: f64 = 0.15;
+/// Places that are followed up before other rotations and sizes are tried.
+const FIRST_PLACES: usize = 2;
+
+fn outside(search: &PlateSearch, map: &LocalMap) -> NotFound {
+    NotFound::OutsideImage {
+        u_px: map.pixel_px.x,
+        v_px: map.pixel_px.y,
+        search_radius_px: search.search_radius_px,
+    }
+}
+
+/// Looks for the searched part and measures it with `measure`, which is given candidates in the
+/// order of their likeness until it accepts one.
+pub(super) fn locate<T>(
     image: &Image8,
     search: &PlateSearch,
     map: &LocalMap,
     part: Part,
-) -> Result<Vec<Candidate>, NotFound> {
+    measure: &dyn Fn(&Candidate) -> Result<T, NotFound>,
+) -> Result<T, NotFound> {
     let rules = search.rules;
-    let mark_px = smallest_mark_m(search, part) * map.scales().0;
-    if !(mark_px >= rules.min_mark_radius_px) {
-        return Err(NotFound::TooSmall {
-            found_px: mark_px,
-            needed_px: rules.min_mark_radius_px,
-        });
-    }
-    let (low, high) = model::bounds(search.layout, part, map);
-    let side = (high.x - low.x).min(high.y - low.y);
-    let mut level = 0;
-    while level < MAX_LEVEL
-        && side / f64::from(2u32 << level) >= MIN_COARSE_SIDE
-        && mark_px / f64::from(2u32 << level) >= MIN_COARSE_MARK
-    {
-        level += 1;
-    }
-    let outside = || NotFound::OutsideImage {
-        u_px: map.pixel_px.x,
-        v_px: map.pixel_px.y,
-        search_radius_px: search.search_radius_px,
-    };
-    // the widest hypothesis must fit
-    let room = search.search_radius_px + 0.15 * (high - low).max() + 2.0 * f64::from(1u32 << level);
-    let clamp = |x: f64, size: u32| x.clamp(0.0, f64::from(size)) as u32;
-    let left = clamp((low.x - room).floor(), image.width_px);
-    let top = clamp((low.y - room).floor(), image.height_px);
-    let right = clamp((high.x + room).ceil() + 1.0, image.width_px);
-    let bottom = clamp((high.y + room).ceil() + 1.0, image.height_px);
-    if right <= left || bottom <= top {
-        return Err(outside());
-    }
-    let window = SearchImage::new(image, left, top, right - left, bottom - top, level);
-    let corner = Vector2::new(f64::from(left), f64::from(top));
+    let field = Field::new(image, search, map, part)?;
+    let at_once = correlate(&field, map);
+    let mut placed = at_once.is_some();
+    let mut places = field.distinct(at_once.unwrap_or_default());
+    let enough = |c: &&Candidate| c.score >= rules.min_coarse_score;
 
-    let mut found: Vec<Candidate> = Vec::new();
-    let mut placed = false;
-    let mut attempt = |variant: &LocalMap, found: &mut Vec<Candidate>| {
-        if let Some(list) = correlate(search, variant, part, &window, corner, level) {
-            placed = true;
-            found.extend(list);
+    for place in places.iter().filter(enough).take(FIRST_PLACES) {
+        // a single crossing needs no more than its place when it looks as predicted
+        if part == Part::Saddle
+            && place.score >= rules.min_saddle_score
+            && let Ok(found) = measure(place)
+        {
+            return Ok(found);
         }
-    };
-    attempt(map, &mut found);
-    let best = |found: &[Candidate]| found.iter().map(|c| c.score).fold(-1.0, f64::max);
-    if best(&found) < rules.good_coarse_score {
-        for variant in variants(search, map) {
-            attempt(&variant, &mut found);
+        if let Some(aligned) = refine(image, search, place, part, field.level)
+            && aligned.score >= rules.good_coarse_score
+            && let Ok(found) = measure(&aligned)
+        {
+            return Ok(found);
+        }
+    }
+    for variant in variants(search, map) {
+        if let Some(more) = correlate(&field, &variant) {
+            placed = true;
+            places.extend(more);
         }
     }
     if !placed {
-        return Err(outside());
+        return Err(outside(search, map));
     }
-    found.sort_by(|a, b| b.score.total_cmp(&a.score));
-    let score = best(&found);
-    if score < rules.min_coarse_score {
-        return Err(NotFound::LowScore {
-            score,
-            limit: rules.min_coarse_score,
-        });
-    }
-    let mut aligned: Vec<Candidate> = Vec::new();
-    let mut tried: Vec<Vector2<f64>> = Vec::new();
-    for candidate in found.iter().filter(|c| c.score >= rules.min_coarse_score) {
-        if tried.len() >= rules.max_candidates {
-            break;
-        }
-        let near = 0.15 * side;
-        if tried
-            .iter()
-            .any(|p| (p - candidate.map.pixel_px).norm() < near)
-        {
-            continue;
-        }
-        tried.push(candidate.map.pixel_px);
-        if let Some(better) = refine(image, search, candidate, part, level) {
-            aligned.push(better);
-            if better.score >= rules.good_coarse_score {
-                break; // unmistakable
+    places = field.distinct(places);
+    let score = places.first().map_or(0.0, |c| c.score);
+    let mut aligned: Vec<Candidate> = places
+        .iter()
+        .filter(enough)
+        .take(rules.max_candidates)
+        .filter_map(|place| refine(image, search, place, part, field.level))
+        .collect();
+    aligned.sort_by(|a, b| b.score.total_cmp(&a.score));
+    let mut failure = None;
+    for candidate in &aligned {
+        match measure(candidate) {
+            Ok(found) => return Ok(found),
+            Err(e) => {
+                failure.get_or_insert(e);
             }
         }
     }
-    aligned.sort_by(|a, b| b.score.total_cmp(&a.score));
-    if aligned.is_empty() {
-        return Err(NotFound::LowScore {
-            score,
-            limit: rules.min_score,
-        });
-    }
-    Ok(aligned)
+    Err(failure.unwrap_or(NotFound::LowScore {
+        score,
+        limit: rules.min_coarse_score,
+    }))
 }
 
 /// The predicted map turned, scaled and foreshortened as the rules say.
@@ -171,14 +222,16 @@ fn variants(search: &PlateSearch, map: &LocalMap) -> Vec<LocalMap> {
 }
 
 /// Correlates one appearance over the window. `None` if it does not fit in.
-fn correlate(
-    search: &PlateSearch,
-    map: &LocalMap,
-    part: Part,
-    window: &SearchImage,
-    corner: Vector2<f64>,
-    level: u32,
-) -> Option<Vec<Candidate>> {
+fn correlate(field: &Field, map: &LocalMap) -> Option<Vec<Candidate>> {
+    let Field {
+        search,
+        part,
+        window,
+        corner,
+        level,
+        ..
+    } = field;
+    let (part, level) = (*part, *level);
     let step = f64::from(1u32 << level);
     let (low, high) = model::bounds(search.layout, part, map);
     let size = |a: f64, b: f64| ((b - a) / step).ceil() as usize + 1;
@@ -245,11 +298,11 @@ fn refine(
 ) -> Option<Candidate> {
     let mut map = start.map;
     let mut score = 0.0;
-    for level in (0..=level).rev() {
+    // half resolution is enough: the fit of the points does the rest
+    for level in (level.min(1)..=level).rev() {
         let step = f64::from(1u32 << level);
         let sigma = level_sigma(search.rules.blur_sigma_px, level);
-        let steps = if level == 0 { 6 } else { MAX_STEPS };
-        for _ in 0..steps {
+        for _ in 0..MAX_STEPS {
             let (next, moved, ncc) = align_step(image, search, &map, part, level, sigma)?;
             map = next;
             score = ncc;

@@ -174,20 +174,9 @@ fn prepare(image: &Image8, search: &PlateSearch) -> Result<model::LocalMap, NotF
 /// [`NotFound::LowScore`] or [`NotFound::TooFewPoints`].
 pub fn find_plate(image: &Image8, search: &PlateSearch) -> Result<PlateObservation, NotFound> {
     let map = prepare(image, search)?;
-    let candidates = align::coarse(image, search, &map, model::Part::Plate)?;
-    let mut failure = None;
-    for candidate in candidates {
-        match points::measure(image, search, &candidate) {
-            Ok(found) => return Ok(found),
-            Err(e) => {
-                failure.get_or_insert(e);
-            }
-        }
-    }
-    Err(failure.unwrap_or(NotFound::LowScore {
-        score: 0.0,
-        limit: search.rules.min_coarse_score,
-    }))
+    align::locate(image, search, &map, model::Part::Plate, &|candidate| {
+        points::measure(image, search, candidate)
+    })
 }
 
 /// Finds the central marker alone: the position-only fiducial of the paper.
@@ -200,20 +189,9 @@ pub fn find_saddle(image: &Image8, search: &PlateSearch) -> Result<PointObservat
     let centre = Vector3::new(saddle.x_m, saddle.y_m, 0.0);
     let pose = &search.predicted_camera_frame_from_plate;
     let map = model::LocalMap::new(search.camera, pose, &centre)?;
-    let candidates = align::coarse(image, search, &map, model::Part::Saddle)?;
-    let mut failure = None;
-    for candidate in candidates {
-        match points::measure_saddle(image, search, &candidate) {
-            Ok(found) => return Ok(found),
-            Err(e) => {
-                failure.get_or_insert(e);
-            }
-        }
-    }
-    Err(failure.unwrap_or(NotFound::LowScore {
-        score: 0.0,
-        limit: search.rules.min_coarse_score,
-    }))
+    align::locate(image, search, &map, model::Part::Saddle, &|candidate| {
+        points::measure_saddle(image, search, candidate)
+    })
 }
 
 #[cfg(test)]

@@ -100,6 +100,7 @@ impl LocalMap {
 }
 
 /// Standard normal distribution function and density from a table: error below 3e-6.
+#[derive(Debug)]
 struct Normal {
     table: Vec<(f32, f32)>,
 }
@@ -172,6 +173,7 @@ pub(super) struct MarkModel {
     sigma: f32,
     size_m: f32,
     kind: MarkKind,
+    normal: &'static Normal,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -199,6 +201,7 @@ impl MarkModel {
             sigma: sigma_px as f32,
             size_m: size_m as f32,
             kind,
+            normal: normal(),
         }
     }
 
@@ -244,7 +247,7 @@ impl MarkModel {
         let slope = (gu * gu + gv * gv).sqrt();
         let edge_px = (radius - self.size_m) / slope;
         let z = edge_px / self.sigma;
-        let (p, density) = normal().at(-z);
+        let (p, density) = self.normal.at(-z);
         let rate = density / self.sigma;
         Darkness {
             value: p,
@@ -262,7 +265,7 @@ impl MarkModel {
         let line = |value: f32, row: [f32; 2]| {
             let slope = (row[0] * row[0] + row[1] * row[1]).sqrt() * w;
             let z = value / slope / self.sigma;
-            let (p, density) = normal().at(z);
+            let (p, density) = self.normal.at(z);
             let rate = 2.0 * density / self.sigma;
             let unit = [row[0] * w / slope, row[1] * w / slope];
             (2.0 * p - 1.0, rate, unit, -rate * z, slope)
@@ -281,7 +284,7 @@ impl MarkModel {
         let inner_v = 0.5 * (rate_x * unit_x[1] * ey + ex * rate_y * unit_y[1]);
         // the checker ends at the square's border, blurred like any edge
         let z = edge_px / self.sigma;
-        let (inside, density) = normal().at(-z);
+        let (inside, density) = self.normal.at(-z);
         let fade = density / self.sigma;
         Darkness {
             value: inner * inside,

@@ -93,8 +93,10 @@ struct MarkFit {
 }
 
 const MAX_STEPS: usize = 10;
-/// A fit has settled when a step is shorter than this, px.
-const SETTLED_PX: f64 = 0.001;
+/// A fit has settled when its last step was shorter than this, px; what remains is far smaller.
+const SETTLED_PX: f64 = 0.005;
+/// The same for a first fit that only serves to find the pose.
+const ROUGHLY_SETTLED_PX: f64 = 0.05;
 /// Bounds of the fitted blur, px.
 const BLUR_RANGE_PX: (f64, f64) = (0.4, 3.0);
 /// Width of the strip along the plate's border that the surroundings blur into, px.
@@ -158,13 +160,14 @@ impl<'a> Mark<'a> {
     }
 }
 
-/// Fits position, gain, offset and, if `free_blur`, the blur.
+/// Fits position, gain, offset and, if `free_blur`, the blur; `rough` stops early.
 fn fit(
     image: &Image8,
     mark: &Mark,
     start: &LocalMap,
     blur_px: f64,
     free_blur: bool,
+    rough: bool,
     rules: &DetectionRules,
 ) -> Result<MarkFit, PointFault> {
     let (shortest, longest) = start.scales();
@@ -183,6 +186,11 @@ fn fit(
         PointKind::Saddle => rules.saddle_window_px + 1.0,
     };
     let border = rules.image_border_px;
+    let settled_px = if rough {
+        ROUGHLY_SETTLED_PX
+    } else {
+        SETTLED_PX
+    };
     let (mut centre, mut blur) = (start.pixel_px, blur_px);
     let mut last = None;
     for _ in 0..MAX_STEPS {
@@ -221,7 +229,7 @@ fn fit(
         if !(moved <= rules.max_correction_px) {
             return Err(diverged(moved));
         }
-        let settled = length < SETTLED_PX;
+        let settled = length < settled_px;
         last = Some((step, settled));
         if settled {
             break;
@@ -447,7 +455,15 @@ fn fit_all(
         let start = blur_px.unwrap_or(rules.blur_sigma_px);
         all.push((
             index,
-            fit(image, &mark, &map, start, blur_px.is_none(), rules),
+            fit(
+                image,
+                &mark,
+                &map,
+                start,
+                blur_px.is_none(),
+                blur_px.is_none(),
+                rules,
+            ),
         ));
     }
     all
@@ -620,6 +636,7 @@ pub(super) fn measure_saddle(
         &candidate.map,
         rules.blur_sigma_px,
         true,
+        false,
         rules,
     )
     .map_err(refuse)?;

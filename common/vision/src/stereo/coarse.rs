@@ -1,6 +1,6 @@
 //! Whole-pixel search along the epipolar curve, for a few surface slants.
 
-use nalgebra::{Vector2, Vector3};
+use nalgebra::{Matrix2, Vector2, Vector3};
 use rover_cameras::Camera;
 
 use super::link::Link;
@@ -88,73 +88,63 @@ pub(super) fn slants(link: &Link, rules: &MatchRules) -> Vec<Vector2<f64>> {
     all
 }
 
+/// How the window is warped before it is compared.
+pub(super) enum Warp {
+    /// For each slant hypothesis of the rules.
+    Slants,
+    /// By this affine map of offsets into the other image.
+    Known(Matrix2<f64>),
+}
+
+/// Above this score of the first hypothesis the others are not tried.
+const GOOD_SCORE: f32 = 0.93;
+/// Peaks of the first hypothesis around which the others are tried.
+const FOLLOWED_PEAKS: usize = 4;
+
 /// The best places along the curve, at least three pixels apart, best first.
 pub(super) fn search(
     (a, b): (&Camera, &Camera),
     (from, to): (&PreparedImage, &PreparedImage),
     pixel: &Vector2<f64>,
+    warp: &Warp,
     rules: &MatchRules,
     keep: usize,
 ) -> Result<Vec<CoarseMatch>, MatchFailure> {
     let stops = stops(a, b, to, pixel, rules)?;
-    let middle = stops[stops.len() / 2].inverse_range;
-    let link = Link::new(a, b, pixel, middle).map_err(MatchFailure::camera)?;
-    let half = rules.half_search_window_px as usize;
-    let side = 2 * half + 1;
-    let mut values = vec![0.0f32; side * side];
-    let mut best: Vec<(f32, usize)> = vec![(-1.0, 0); stops.len()];
-    let mut any = false;
-    for (hypothesis, slopes) in slants(&link, rules).iter().enumerate() {
-        // window of the other image straight, this image's window warped
-        let Some(inverse) = link.matrix(slopes).try_inverse() else {
-            continue;
-        };
-        let (step_u, step_v) = (inverse.column(0), inverse.column(1));
-        let origin = pixel - inverse * Vector2::repeat(half as f64);
-        let inside = from.spline.sample_grid(
-            [origin.x, origin.y],
-            [step_u[0], step_u[1]],
-            [step_v[0], step_v[1]],
-            side,
-            side,
-            &mut values,
-        );
-        if !inside {
-            continue;
+    let matrices: Vec<Matrix2<f64>> = match warp {
+        Warp::Known(matrix) => vec![*matrix],
+        Warp::Slants => {
+            let middle = stops[stops.len() / 2].inverse_range;
+            let link = Link::new(a, b, pixel, middle).map_err(MatchFailure::camera)?;
+            slants(&link, rules)
+                .iter()
+                .map(|slopes| link.matrix(slopes))
+                .collect()
         }
-        any = true;
-        let Ok(template) = Template::new(side, side, &values, None) else {
+    };
+    let half = rules.half_search_window_px as usize;
+    let mut values = vec![0.0f32; (2 * half + 1).pow(2)];
+    let mut best: Vec<(f32, usize)> = vec![(-1.0, 0); stops.len()];
+    let mut active = vec![true; stops.len()];
+    let mut any = false;
+    for (hypothesis, matrix) in matrices.iter().enumerate() {
+        let Some(template) = warped_template(from, pixel, matrix, half, &mut values) else {
             continue;
         };
-        // runs of stops on one row are correlated together
-        let mut first = 0;
-        while first < stops.len() {
-            let mut last = first;
-            while last + 1 < stops.len()
-                && stops[last + 1].v == stops[first].v
-                && stops[last + 1].u.abs_diff(stops[last].u) == 1
-            {
-                last += 1;
+        let first = !any;
+        any = true;
+        correlate(&template, to, half, &stops, &active, hypothesis, &mut best);
+        if first {
+            let top = best.iter().map(|b| b.0).fold(-1.0, f32::max);
+            if top >= GOOD_SCORE {
+                break;
             }
-            let run = &stops[first..=last];
-            let left = run.iter().map(|s| s.u).min().unwrap_or(0);
-            let map = score_map(
-                &to.grey,
-                &template,
-                left - half,
-                run[0].v - half,
-                run.len(),
-                1,
-            );
-            if let Some(map) = map {
-                for (k, stop) in run.iter().enumerate() {
-                    let score = map.scores.get(stop.u - left).copied().unwrap_or(-1.0);
-                    if score > best[first + k].0 {
-                        best[first + k] = (score, hypothesis);
-                    }
+            if f64::from(top) >= rules.min_search_score {
+                active.fill(false);
+                for peak in peak_indices(&best).into_iter().take(FOLLOWED_PEAKS) {
+                    active[peak.saturating_sub(3)..(peak + 4).min(stops.len())].fill(true);
                 }
             }
-            first = last + 1;
         }
     }
     if !any {
@@ -166,22 +156,98 @@ pub(super) fn search(
     Ok(peaks(&stops, &best, keep))
 }
 
-/// Local maxima over two neighbours on each side.
-fn peaks(stops: &[Stop], best: &[(f32, usize)], keep: usize) -> Vec<CoarseMatch> {
-    let mut found = Vec::new();
-    for k in 0..stops.len() {
-        let (score, hypothesis) = best[k];
-        let near = k.saturating_sub(2)..(k + 3).min(stops.len());
-        if near
-            .into_iter()
-            .any(|i| best[i].0 > score || (best[i].0 == score && i < k))
-        {
+/// The window around a pixel as the other image would show it. `None` if it leaves the image or
+/// has no contrast.
+fn warped_template(
+    from: &PreparedImage,
+    pixel: &Vector2<f64>,
+    matrix: &Matrix2<f64>,
+    half: usize,
+    values: &mut [f32],
+) -> Option<Template> {
+    let inverse = matrix.try_inverse()?;
+    let side = 2 * half + 1;
+    let origin = pixel - inverse * Vector2::repeat(half as f64);
+    let inside = from.spline.sample_grid(
+        [origin.x, origin.y],
+        [inverse.m11, inverse.m21],
+        [inverse.m12, inverse.m22],
+        side,
+        side,
+        values,
+    );
+    if inside {
+        Template::new(side, side, values, None).ok()
+    } else {
+        None
+    }
+}
+
+/// Raises `best` where the template scores higher at an active stop. Runs of stops on one row are
+/// correlated together.
+fn correlate(
+    template: &Template,
+    to: &PreparedImage,
+    half: usize,
+    stops: &[Stop],
+    active: &[bool],
+    hypothesis: usize,
+    best: &mut [(f32, usize)],
+) {
+    let mut first = 0;
+    while first < stops.len() {
+        if !active[first] {
+            first += 1;
             continue;
         }
+        let mut last = first;
+        while last + 1 < stops.len()
+            && active[last + 1]
+            && stops[last + 1].v == stops[first].v
+            && stops[last + 1].u.abs_diff(stops[last].u) == 1
+        {
+            last += 1;
+        }
+        let run = &stops[first..=last];
+        let left = run[0].u.min(run[run.len() - 1].u);
+        if let Some(map) = score_map(
+            &to.grey,
+            template,
+            left - half,
+            run[0].v - half,
+            run.len(),
+            1,
+        ) {
+            for (stop, best) in run.iter().zip(&mut best[first..]) {
+                let score = map.scores.get(stop.u - left).copied().unwrap_or(-1.0);
+                if score > best.0 {
+                    *best = (score, hypothesis);
+                }
+            }
+        }
+        first = last + 1;
+    }
+}
+
+/// Indices of the local maxima over two neighbours on each side, best first.
+fn peak_indices(best: &[(f32, usize)]) -> Vec<usize> {
+    let is_peak = |k: usize| {
+        let near = k.saturating_sub(2)..(k + 3).min(best.len());
+        near.into_iter()
+            .all(|i| best[i].0 < best[k].0 || (best[i].0 == best[k].0 && i >= k))
+    };
+    let mut found: Vec<usize> = (0..best.len()).filter(|&k| is_peak(k)).collect();
+    found.sort_by(|&a, &b| best[b].0.total_cmp(&best[a].0).then(a.cmp(&b)));
+    found
+}
+
+/// The best peaks, refined by a parabola along the curve.
+fn peaks(stops: &[Stop], best: &[(f32, usize)], keep: usize) -> Vec<CoarseMatch> {
+    let refined = |k: usize| {
+        let (score, hypothesis) = best[k];
         let whole = Vector2::new(stops[k].u as f64, stops[k].v as f64);
-        let inner = k > 0 && k + 1 < stops.len();
         let (mut pixel, mut inverse_range) = (whole, stops[k].inverse_range);
-        if inner {
+        if k > 0 && k + 1 < stops.len() {
             let (l, c, r) = (
                 f64::from(best[k - 1].0),
                 f64::from(score),
@@ -200,18 +266,16 @@ fn peaks(stops: &[Stop], best: &[(f32, usize)], keep: usize) -> Vec<CoarseMatch>
                 inverse_range += (other.inverse_range - inverse_range) * shift.abs();
             }
         }
-        found.push(CoarseMatch {
+        CoarseMatch {
             inverse_range,
             pixel,
             score: f64::from(score),
             hypothesis,
-        });
-    }
-    found.sort_by(|a, b| {
-        b.score
-            .total_cmp(&a.score)
-            .then(a.inverse_range.total_cmp(&b.inverse_range))
-    });
-    found.truncate(keep);
-    found
+        }
+    };
+    peak_indices(best)
+        .into_iter()
+        .take(keep)
+        .map(refined)
+        .collect()
 }

@@ -3,7 +3,7 @@
 use nalgebra::{Matrix2, Vector2};
 use rover_cameras::{Camera, CameraError, StereoPair};
 
-use super::coarse::{self, CoarseMatch};
+use super::coarse::{self, CoarseMatch, Warp};
 use super::link::Link;
 use super::refine::{Displacement, LeftWindow, Refined, refine};
 use super::{MatchRules, PreparedImage};
@@ -134,7 +134,7 @@ impl MatchFailure {
 /// Candidates of the search that are fitted.
 const FITTED_CANDIDATES: usize = 3;
 /// Candidates that score this much less than the best in the search are not fitted.
-const CANDIDATE_GAP: f64 = 0.3;
+const CANDIDATE_GAP: f64 = 0.2;
 /// Two fits closer than this are the same place, px.
 const SAME_PLACE_PX: f64 = 2.0;
 
@@ -198,7 +198,14 @@ pub(super) fn match_checked(
         });
     }
     let cameras = (&pair.left, &pair.right);
-    let candidates = coarse::search(cameras, (left, right), left_px, rules, FITTED_CANDIDATES)?;
+    let candidates = coarse::search(
+        cameras,
+        (left, right),
+        left_px,
+        &Warp::Slants,
+        rules,
+        FITTED_CANDIDATES,
+    )?;
     let top = candidates.first().map_or(-1.0, |c| c.score);
     if top < rules.min_search_score {
         return Err(MatchFailure::LowScore {
@@ -318,10 +325,17 @@ fn check_mutual(
     found: &StereoMatch,
     rules: &MatchRules,
 ) -> Result<(), MatchFailure> {
+    let Some(inverse) = found.affine.try_inverse() else {
+        return Err(MatchFailure::TooSteep {
+            slope: f64::INFINITY,
+            limit: rules.max_slope,
+        });
+    };
     let back = coarse::search(
         (&pair.right, &pair.left),
         (right, left),
         &found.right_px,
+        &Warp::Known(inverse),
         rules,
         1,
     )?;

@@ -42,15 +42,23 @@ const ASSUMED_NOISE_DN: f64 = 2.0;
 /// Least gain between the windows.
 const MIN_GAIN: f64 = 0.2;
 
-/// The left window: values and gradients at whole pixels around a pixel.
+/// The left window: values and gradients at whole pixels around a pixel, in rows padded with
+/// zeros to whole vectors.
 pub(super) struct LeftWindow {
     half: usize,
     side: usize,
+    stride: usize,
     /// Offset of the first window pixel from the exact pixel.
     first: Vector2<f64>,
+    /// Values less their mean.
     values: Vec<f32>,
-    gradients: Vec<[f32; 2]>,
+    gradient_u: Vec<f32>,
+    gradient_v: Vec<f32>,
+    /// 1 in the window, 0 in the padding.
+    ones: Vec<f32>,
     mean: f32,
+    /// Sum of the squares of `values`.
+    square: f64,
     /// Standard deviation, DN.
     pub deviation_dn: f64,
 }
@@ -65,42 +73,69 @@ impl LeftWindow {
             return None;
         }
         let side = 2 * half + 1;
+        let stride = side.div_ceil(LANES) * LANES;
         let (u0, v0) = (cu as usize - half, cv as usize - half);
-        let mut values = Vec::with_capacity(side * side);
-        let mut gradients = Vec::with_capacity(side * side);
-        for v in v0..v0 + side {
-            let row = &image.grey.values(v)[u0..u0 + side];
-            values.extend(row.iter().map(|&x| SearchImage::grey(x)));
-            gradients.extend((u0..u0 + side).map(|u| image.spline.gradient_at_pixel(u, v)));
+        let plane = || vec![0.0f32; stride * side];
+        let (mut values, mut ones, mut gradient_u, mut gradient_v) =
+            (plane(), plane(), plane(), plane());
+        let mut sum = 0.0;
+        for j in 0..side {
+            let at = j * stride..j * stride + side;
+            let row = &image.grey.values(v0 + j)[u0..u0 + side];
+            for (x, &held) in values[at.clone()].iter_mut().zip(row) {
+                *x = SearchImage::grey(held);
+                sum += f64::from(*x);
+            }
+            ones[at.clone()].fill(1.0);
+            image
+                .spline
+                .gradient_row(u0, v0 + j, &mut gradient_u[at.clone()], &mut gradient_v[at]);
         }
-        let n = values.len() as f64;
-        let mean = values.iter().map(|&x| f64::from(x)).sum::<f64>() / n;
-        let variance = values
-            .iter()
-            .map(|&x| (f64::from(x) - mean).powi(2))
-            .sum::<f64>()
-            / n;
-        for x in &mut values {
-            *x -= mean as f32;
+        let n = (side * side) as f64;
+        let mean = (sum / n) as f32;
+        for (x, one) in values.iter_mut().zip(&ones) {
+            *x -= mean * one;
         }
+        let square = dot(&values, &values);
         Some(Self {
             half,
             side,
+            stride,
             first: Vector2::new(u0 as f64 - pixel.x, v0 as f64 - pixel.y),
             values,
-            gradients,
-            mean: mean as f32,
-            deviation_dn: variance.sqrt(),
+            gradient_u,
+            gradient_v,
+            ones,
+            mean,
+            square,
+            deviation_dn: (square / n).sqrt(),
         })
     }
 }
 
 type Normal = SMatrix<f64, 6, 6>;
 
-/// Derivative columns of every window pixel and their normal matrix.
+/// Number of partial sums in [`dot`].
+const LANES: usize = 8;
+
+/// Dot product with a fixed order of summation. Lengths are equal multiples of [`LANES`].
+#[inline(always)]
+fn dot(a: &[f32], b: &[f32]) -> f64 {
+    let mut sums = [0.0f32; LANES];
+    for (a, b) in a.chunks_exact(LANES).zip(b.chunks_exact(LANES)) {
+        for ((s, x), y) in sums.iter_mut().zip(a).zip(b) {
+            *s += x * y;
+        }
+    }
+    f64::from(
+        ((sums[0] + sums[4]) + (sums[1] + sums[5])) + ((sums[2] + sums[6]) + (sums[3] + sums[7])),
+    )
+}
+
+/// Derivatives by the four geometric parameters, one padded plane each, and the normal matrix.
 struct Derivatives {
     slopes: Vector2<f64>,
-    columns: Vec<[f32; 4]>,
+    planes: [Vec<f32>; 4],
     factor: nalgebra::linalg::Cholesky<f64, nalgebra::Const<6>>,
 }
 
@@ -113,37 +148,38 @@ impl Derivatives {
         let (bu, bv) = (across.x as f32, across.y as f32);
         let scale = 1.0 / window.half as f32;
         let (fu, fv) = (window.first.x as f32 * scale, window.first.y as f32 * scale);
-        let mut columns = Vec::with_capacity(window.values.len());
-        let mut normal = Normal::zeros();
+        let length = window.values.len();
+        let mut planes = [
+            vec![0.0; length],
+            vec![0.0; length],
+            vec![0.0; length],
+            vec![0.0; length],
+        ];
         for j in 0..window.side {
             let dv = fv + j as f32 * scale;
-            let mut row = [0.0f32; 21];
             for i in 0..window.side {
-                let at = j * window.side + i;
-                let [gu, gv] = window.gradients[at];
-                let (e, n) = (au * gu + av * gv, bu * gu + bv * gv);
-                let c = [e, e * (fu + i as f32 * scale), e * dv, n];
-                columns.push(c);
-                let all = [c[0], c[1], c[2], c[3], window.values[at], 1.0];
-                let mut k = 0;
-                for p in 0..6 {
-                    for q in p..6 {
-                        row[k] += all[p] * all[q];
-                        k += 1;
-                    }
-                }
-            }
-            let mut k = 0;
-            for p in 0..6 {
-                for q in p..6 {
-                    normal[(p, q)] += f64::from(row[k]);
-                    k += 1;
-                }
+                let at = j * window.stride + i;
+                let (gu, gv) = (window.gradient_u[at], window.gradient_v[at]);
+                let e = au * gu + av * gv;
+                planes[0][at] = e;
+                planes[1][at] = e * (fu + i as f32 * scale);
+                planes[2][at] = e * dv;
+                planes[3][at] = bu * gu + bv * gv;
             }
         }
+        let all: [&[f32]; 6] = [
+            &planes[0],
+            &planes[1],
+            &planes[2],
+            &planes[3],
+            &window.values,
+            &window.ones,
+        ];
+        let mut normal = Normal::zeros();
         for p in 0..6 {
-            for q in 0..p {
-                normal[(p, q)] = normal[(q, p)];
+            for q in p..6 {
+                normal[(p, q)] = dot(all[p], all[q]);
+                normal[(q, p)] = normal[(p, q)];
             }
         }
         normal[(3, 3)] += hold;
@@ -153,7 +189,7 @@ impl Derivatives {
         }
         Some(Self {
             slopes,
-            columns,
+            planes,
             factor: normal.cholesky()?,
         })
     }
@@ -173,15 +209,11 @@ pub(super) fn refine(
         needed_dn: rules.min_texture_dn,
     };
     let half = window.half as f64;
-    let count = window.values.len();
+    let count = window.side * window.side;
     let mut now = start;
     let mut samples = vec![0.0f32; count];
+    let mut padded = vec![0.0f32; window.values.len()];
     let mut derivatives = Derivatives::new(window, link, now.slopes, hold).ok_or_else(singular)?;
-    let square_left: f64 = window
-        .values
-        .iter()
-        .map(|&x| f64::from(x) * f64::from(x))
-        .sum();
     for _ in 0..MAX_STEPS {
         let matrix = link.matrix(&now.slopes);
         let origin = link.at
@@ -199,8 +231,17 @@ pub(super) fn refine(
         if !inside {
             return Err(MatchFailure::CurveOutsideImage);
         }
-        let sums = products(window, &derivatives.columns, &samples);
-        let mut right_side = SVector::<f64, 6>::from_column_slice(&sums[..6]);
+        pad(window, &samples, &mut padded);
+        let d = &derivatives.planes;
+        let (cross, sum) = (dot(&window.values, &padded), dot(&window.ones, &padded));
+        let mut right_side = SVector::<f64, 6>::from([
+            dot(&d[0], &padded),
+            dot(&d[1], &padded),
+            dot(&d[2], &padded),
+            dot(&d[3], &padded),
+            cross,
+            sum,
+        ]);
         right_side[3] += now.across_px * hold;
         let x = derivatives.factor.solve(&right_side);
         let gain = x[4];
@@ -238,9 +279,9 @@ pub(super) fn refine(
             .max(half * step.slopes.amax());
         if size < SETTLED_PX {
             let n = count as f64;
-            let (sum, square, cross) = (sums[5], sums[6], sums[4]);
+            let square = dot(&padded, &padded);
             let variance = square - sum * sum / n;
-            let score = cross / (square_left * variance).sqrt();
+            let score = cross / (window.square * variance).sqrt();
             let residual = (square - x.dot(&right_side)).max(0.0) / (n - 6.0);
             let inverse = derivatives.factor.inverse();
             let sigma = (residual.max(0.1) * inverse[(0, 0)]).sqrt() / gain;
@@ -260,27 +301,14 @@ pub(super) fn refine(
     })
 }
 
-/// Sums of sample times each column, times left value, of the samples, and of their squares; the
-/// samples are taken relative to the left window's mean.
-fn products(window: &LeftWindow, columns: &[[f32; 4]], samples: &[f32]) -> [f64; 7] {
-    let mut total = [0.0f64; 7];
+/// Copies the samples, less the left window's mean, into padded rows.
+fn pad(window: &LeftWindow, samples: &[f32], padded: &mut [f32]) {
     let lines = samples
         .chunks_exact(window.side)
-        .zip(columns.chunks_exact(window.side));
-    for ((line, columns), left) in lines.zip(window.values.chunks_exact(window.side)) {
-        let mut row = [0.0f32; 7];
-        for ((&sample, column), &l) in line.iter().zip(columns).zip(left) {
-            let y = sample - window.mean;
-            for (r, c) in row.iter_mut().zip(column) {
-                *r += y * c;
-            }
-            row[4] += y * l;
-            row[5] += y;
-            row[6] += y * y;
-        }
-        for (t, r) in total.iter_mut().zip(row) {
-            *t += f64::from(r);
+        .zip(padded.chunks_exact_mut(window.stride));
+    for (line, out) in lines {
+        for (o, x) in out.iter_mut().zip(line) {
+            *o = x - window.mean;
         }
     }
-    total
 }

@@ -1,0 +1,75 @@
+//! Whole placements: accuracy over seeds, determinism, the shipped variants.
+
+use crate::command::run;
+use serde_json::Value;
+
+fn number(report: &Value, path: &str) -> f64 {
+    report.pointer(path).and_then(Value::as_f64).unwrap_or_else(|| panic!("no {path}: {report:#}"))
+}
+
+#[test]
+fn the_testbed_is_placed_within_its_budget_over_seeds() {
+    let mut lateral = Vec::new();
+    let mut open_loop = Vec::new();
+    for seed in 101..=108 {
+        let (code, report) = run(&["scenarios/bluestreak.toml", "--seed", &seed.to_string()]);
+        assert_eq!((code, &report["outcome"]), (0, &Value::from("placed")), "{report:#}");
+        assert_eq!(report["contact"]["made"], true);
+        lateral.push(number(&report, "/truth/lateral_error_mm"));
+        open_loop.push(number(&report, "/truth/open_loop_lateral_error_mm"));
+    }
+    println!("lateral {lateral:.3?} mm, open loop {open_loop:.1?} mm");
+    let median = |values: &mut Vec<f64>| {
+        values.sort_by(f64::total_cmp);
+        (values[values.len() / 2 - 1] + values[values.len() / 2]) / 2.0
+    };
+    let (closed, open) = (median(&mut lateral), median(&mut open_loop));
+    assert!(closed <= 1.0, "median lateral error {closed} mm");
+    assert!(lateral.iter().all(|&e| e <= 2.5), "{lateral:?}");
+    assert!(open >= 12.0 * closed, "open loop {open} mm, closed loop {closed} mm");
+}
+
+#[test]
+fn without_model_error_half_a_millimetre_is_kept() {
+    let (code, report) = run(&["scenarios/bluestreak_perfect.toml"]);
+    assert_eq!(code, 0, "{report:#}");
+    assert!(number(&report, "/truth/lateral_error_mm") <= 0.5, "{report:#}");
+}
+
+#[test]
+fn a_hidden_fiducial_is_bridged_by_what_was_seen_before() {
+    let (code, report) = run(&["scenarios/bluestreak_occluded.toml"]);
+    assert_eq!(code, 0, "{report:#}");
+    let found = report["servo"]["fiducial_found"].as_array().unwrap();
+    assert!(found.contains(&Value::from(true)) && found.contains(&Value::from(false)), "{found:?}");
+    let lateral = number(&report, "/truth/lateral_error_mm");
+    assert!(lateral < number(&report, "/truth/open_loop_lateral_error_mm") / 3.0, "{report:#}");
+}
+
+#[test]
+fn a_missing_surface_ends_the_run_safely_with_exit_3() {
+    let (code, report) = run(&["scenarios/bluestreak_missed.toml"]);
+    assert_eq!(code, 3, "{report:#}");
+    assert_eq!(report["outcome"], "aborted");
+    assert!(report["reason"].as_str().unwrap().starts_with("no_contact"), "{report:#}");
+}
+
+#[test]
+fn a_pixel_in_the_sky_is_refused_with_exit_3_and_a_reason() {
+    let (code, report) = run(&["--set", "target.pixel_px=[638.0, 2.0]"]);
+    assert_eq!(code, 3, "{report:#}");
+    let reason = report["reason"].as_str().unwrap();
+    assert!(reason.contains("638") && report["phases"][0]["name"] == "designate", "{report:#}");
+}
+
+#[test]
+fn one_seed_gives_one_digest_in_process_and_in_processes() {
+    let (_, first) = run(&["--seed", "7"]);
+    let (_, again) = run(&["--seed", "7"]);
+    let (_, apart) = run(&["--seed", "7", "--processes"]);
+    let (_, other) = run(&["--seed", "8"]);
+    assert_eq!(first["outcome"], "placed", "{first:#}");
+    assert_eq!(first["digest"], again["digest"]);
+    assert_eq!(first["digest"], apart["digest"]);
+    assert_ne!(first["digest"], other["digest"]);
+}
