@@ -58,7 +58,7 @@ fn grey(x: f64, y: f64) -> f64 {
     if BARE_Y_M.contains(&y) {
         return 120.0;
     }
-    40.0 + 170.0 * (0.6 * noise(x, y, 0.008) + 0.4 * noise(x + 3.1, y - 1.7, 0.02))
+    40.0 + 170.0 * (0.6 * noise(x, y, 0.015) + 0.4 * noise(x + 3.1, y - 1.7, 0.04))
 }
 
 fn picture(camera: &Camera) -> ImageData {
@@ -149,18 +149,17 @@ impl FakeHardware {
                     images: raw.clone(),
                     cameras: pair.cameras.clone(),
                 };
-                let capture = peer.serve(
-                    &keys::imaging_capture(&pair.name),
-                    move |_: CaptureRequest| {
-                        let frame = frame.clone();
-                        async move { Ok(frame) }
-                    },
-                );
+                let key = keys::imaging_capture(&pair.name);
+                let capture = peer.serve(&key, move |_: CaptureRequest| {
+                    let frame = frame.clone();
+                    async move { Ok(frame) }
+                });
                 served.push(capture.await.unwrap());
             }
             let grab = grab.clone();
-            let grabbed = peer.serve(&keys::camera_grab(&pair.name), move |q: CaptureRequest| {
-                let answer = grab(q, raw.clone());
+            let key = keys::camera_grab(&pair.name);
+            let grabbed = peer.serve(&key, move |request: CaptureRequest| {
+                let answer = grab(request, raw.clone());
                 async move { answer }
             });
             served.push(grabbed.await.unwrap());
