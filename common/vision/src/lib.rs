@@ -1,6 +1,9 @@
 //! Images and what is measured in them: interest points, the end-effector's fiducial, and the
 //! surface under a pixel of a stereo pair.
 
+// `!(x >= limit)` refuses a NaN as well, which `x < limit` would let through
+#![allow(clippy::neg_cmp_op_on_partial_ord)]
+
 pub mod fiducial;
 pub mod harris;
 pub mod image;

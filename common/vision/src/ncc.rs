@@ -13,6 +13,8 @@ const SCALE: i32 = 8;
 const OFFSET: i32 = 1024;
 /// Largest size of a value of a [`SearchImage`].
 const VALUE_LIMIT: i64 = 1024;
+// 4096 squares of such values fit the u32 running sums
+const _: () = assert!(VALUE_LIMIT * VALUE_LIMIT * 4096 <= u32::MAX as i64 + 1);
 /// Vector length that rows are padded to.
 const LANES: usize = 8;
 /// Standard deviation (DN) below which an image window counts as flat: its score is 0.
@@ -670,8 +672,6 @@ pub fn score_map(
         squares: vec![0; width],
     };
     let n = template.count as f64;
-    // 1024^2 per pixel in u32 column sums and row sums
-    debug_assert!(VALUE_LIMIT * VALUE_LIMIT * 4096 <= i64::from(u32::MAX) + 1);
     let mut columns_state = (template.rectangular && template.height <= 4000)
         .then(|| ColumnSums::new(image, left, covered_columns, top, template.height));
     let prefix = columns_state

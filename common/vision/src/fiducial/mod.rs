@@ -150,7 +150,7 @@ fn prepare(image: &Image8, search: &PlateSearch) -> Result<model::LocalMap, NotF
     let bad = |e: &dyn std::fmt::Display| NotFound::BadInput(e.to_string());
     image.validate().map_err(|e| bad(&e))?;
     search.layout.validate().map_err(|e| bad(&e))?;
-    search.rules.validate().map_err(|e| NotFound::BadInput(e))?;
+    search.rules.validate().map_err(NotFound::BadInput)?;
     if (image.width_px, image.height_px) != (search.camera.width_px, search.camera.height_px) {
         return Err(NotFound::BadInput(format!(
             "the image has {} x {} px, the camera model {} x {} px",

@@ -123,8 +123,8 @@ fn random_pose(rig: &Rig, rng: &mut ChaCha8Rng) -> Isometry3<f64> {
         pixel,
         rng.random_range(0.45..0.8),
         rng.random_range(0.0..0.87),
-        rng.random_range(0.0..6.28),
-        rng.random_range(0.0..6.28),
+        rng.random_range(0.0..std::f64::consts::TAU),
+        rng.random_range(0.0..std::f64::consts::TAU),
     )
 }
 
@@ -318,7 +318,7 @@ fn a_shadow_edge_or_an_occluder_costs_points_but_not_accuracy() {
         let pose = random_pose(&rig, &mut rng);
         let mut picture = rig.picture(0, &pose, case);
         let at = rig.pair.left.project(&pose.translation.vector).unwrap();
-        let direction: f64 = rng.random_range(0.0..6.28);
+        let direction: f64 = rng.random_range(0.0..std::f64::consts::TAU);
         let offset: f64 = rng.random_range(4.0..12.0);
         for (i, x) in picture.0.iter_mut().enumerate() {
             let (u, v) = ((i % 640) as f64 - at.x, (i / 640) as f64 - at.y);

@@ -76,7 +76,7 @@ fn random_plane(rng: &mut rand_chacha::ChaCha8Rng) -> (Vector2<f64>, f64, Isomet
         pixel,
         range,
         rng.random_range(0.0..0.87),
-        rng.random_range(0.0..6.28),
+        rng.random_range(0.0..std::f64::consts::TAU),
         0.0,
     );
     (pixel, range, pose)
