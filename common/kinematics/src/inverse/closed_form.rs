@@ -383,16 +383,14 @@ impl<'a> Solver<'a> {
                         continue;
                     }
                 };
-                let elbows = [Elbow::Positive, Elbow::Negative];
-                let branches = elbows.map(|elbow| Branch {
-                    shoulder,
-                    wrist,
-                    elbow,
-                });
-                let postures = elbows.map(|elbow| self.posture(&side, &hand, &plane, elbow));
-                let polished = self.polish(&postures, &branches);
-                for ((posture, branch), theta) in postures.iter().zip(branches).zip(polished) {
-                    let theta = match theta {
+                for elbow in [Elbow::Positive, Elbow::Negative] {
+                    let branch = Branch {
+                        shoulder,
+                        wrist,
+                        elbow,
+                    };
+                    let posture = self.posture(&side, &hand, &plane, elbow);
+                    let theta = match self.polish(&posture, branch) {
                         Ok(theta) => theta,
                         Err(by_m) => {
                             fails((posture.nearest_edge(), by_m));

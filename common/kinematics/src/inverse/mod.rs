@@ -13,7 +13,6 @@ mod polish;
 
 use crate::arm::{Arm, ArmError, LIMIT_TOLERANCE_RAD, MAX_JOINTS};
 use crate::tool::Tool;
-use crate::trig::nearest;
 pub use family::FamilyMismatch;
 use nalgebra::{Unit, Vector3};
 pub use numeric::{NumericOptions, solve_numeric};
@@ -274,7 +273,7 @@ fn into_limits(angle: f64, lower: f64, upper: f64, preferred: f64) -> f64 {
     let near = if (preferred - angle).abs() <= PI {
         angle
     } else {
-        angle + TAU * nearest((preferred - angle) * (1.0 / TAU))
+        angle + TAU * ((preferred - angle) / TAU).round()
     };
     let (low, high) = (lower - LIMIT_TOLERANCE_RAD, upper + LIMIT_TOLERANCE_RAD);
     if near >= low && near <= high {

@@ -91,11 +91,11 @@ fn apart(a: &[f64], b: &[f64]) -> f64 {
 
 #[test]
 fn every_branch_of_100_000_reachable_goals_meets_its_goal_and_one_is_the_original() {
-    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
     let (arms, tools) = (family_arms(), tools());
     let (mut worst_point, mut worst_axis): (f64, f64) = (0.0, 0.0);
     let (mut solutions_seen, mut singular_goals) = (0, 0);
-    for trial in 0..1_000_000 {
+    for trial in 0..100_000 {
         // Half of the goals belong to the flight arm.
         let arm = &arms[if trial % 2 == 0 {
             0
@@ -135,7 +135,7 @@ fn every_branch_of_100_000_reachable_goals_meets_its_goal_and_one_is_the_origina
             );
         }
     }
-    assert!(singular_goals < 500, "{singular_goals}");
+    assert!(singular_goals < 20, "{singular_goals}");
     assert!(worst_point < 1e-12, "point {worst_point:e}");
     assert!(worst_axis < 1e-11, "axis {worst_axis:e}");
     assert!(solutions_seen > 300_000, "{solutions_seen}");
