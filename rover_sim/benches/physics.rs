@@ -14,8 +14,10 @@ fn world() -> World {
     let start = robot.posture("ready").unwrap().to_vec();
     let mut description = SimulationDescription::default();
     description.terrain.height_m = 0.25;
-    description.terrain.rocks =
-        vec![RockDescription { position_m: [0.54, 0.0, 0.27], ..RockDescription::default() }];
+    description.terrain.rocks = vec![RockDescription {
+        position_m: [0.54, 0.0, 0.27],
+        ..RockDescription::default()
+    }];
     World::new(robot, &description, 1, &start).unwrap()
 }
 
@@ -27,15 +29,24 @@ fn steps(criterion: &mut Criterion) {
     group.throughput(Throughput::Elements(steps));
     group.bench_function("holding", |b| b.iter(|| world.advance(PERIODS)));
     let robot = world.robot().clone();
-    let (ready, stow) = (robot.posture("ready").unwrap(), robot.posture("stow").unwrap());
+    let (ready, stow) = (
+        robot.posture("ready").unwrap(),
+        robot.posture("stow").unwrap(),
+    );
     let mut to_stow = true;
     group.bench_function("moving", |b| {
         b.iter(|| {
             if !world.is_moving() {
-                let ends = if to_stow { [ready, stow] } else { [stow, ready] };
+                let ends = if to_stow {
+                    [ready, stow]
+                } else {
+                    [stow, ready]
+                };
                 to_stow = !to_stow;
                 let path = ends.map(<[f64]>::to_vec);
-                world.start(through(&robot.arm, &path, 1.0).unwrap(), Guard::default()).unwrap();
+                world
+                    .start(through(&robot.arm, &path, 1.0).unwrap(), Guard::default())
+                    .unwrap();
             }
             world.advance(PERIODS)
         });

