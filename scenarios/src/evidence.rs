@@ -31,11 +31,26 @@ pub struct Evidence {
     pub score: Option<Score>,
 }
 
-/// Where the outside camera stands, seen from the instrument's tip, m: in front and to the right,
-/// away from arm and cameras.
-const CLOSE_EYE_M: [f64; 3] = [0.30, -0.34, 0.20];
-/// The same for the whole arm.
-const WIDE_EYE_M: [f64; 3] = [0.95, -1.15, 0.70];
+/// An outside camera: where it stands and what it looks at, both seen from the instrument's tip,
+/// and its horizontal field of view.
+struct Outside {
+    eye_m: [f64; 3],
+    look_at_m: [f64; 3],
+    field_of_view_deg: f64,
+}
+
+/// The instrument, from the right and behind: the side that the sun and the fiducial are on.
+const CLOSE: Outside = Outside {
+    eye_m: [-0.20, -0.42, 0.16],
+    look_at_m: [0.0, 0.0, 0.035],
+    field_of_view_deg: 27.0,
+};
+/// The whole arm, from the front right.
+const WIDE: Outside = Outside {
+    eye_m: [0.75, -1.15, 0.55],
+    look_at_m: [-0.14, 0.03, 0.06],
+    field_of_view_deg: 40.0,
+};
 
 impl Evidence {
     pub(crate) async fn designated(&mut self, peer: &Peer, pair: &str, limit: Duration) {
@@ -55,13 +70,13 @@ impl Evidence {
 
     pub(crate) async fn in_contact(&mut self, peer: &Peer, limit: Duration) {
         if self.contact_view.is_none() {
-            self.contact_view = kept("view", view(peer, CLOSE_EYE_M, 30.0, limit).await);
+            self.contact_view = kept("view", view(peer, &CLOSE, limit).await);
         }
     }
 
     pub(crate) async fn after_contact(&mut self, peer: &Peer, limit: Duration) {
         self.in_contact(peer, limit).await;
-        self.scene_view = kept("view", view(peer, WIDE_EYE_M, 38.0, limit).await);
+        self.scene_view = kept("view", view(peer, &WIDE, limit).await);
     }
 }
 
@@ -80,21 +95,16 @@ async fn capture(peer: &Peer, pair: &str, limit: Duration) -> Result<StereoFrame
     .await
 }
 
-async fn view(
-    peer: &Peer,
-    eye_from_tip_m: [f64; 3],
-    field_of_view_deg: f64,
-    limit: Duration,
-) -> Result<ImageData, BusError> {
+async fn view(peer: &Peer, from: &Outside, limit: Duration) -> Result<ImageData, BusError> {
     let truth: TruthState = peer.ask(keys::SIM_TRUTH_STATE, &Nothing {}, limit).await?;
-    let look_at_m = truth.tip_in_world_m;
-    let eye_m = [0, 1, 2].map(|i| look_at_m[i] + eye_from_tip_m[i]);
+    let tip = truth.tip_in_world_m;
+    let at = |offset: [f64; 3]| [0, 1, 2].map(|i| tip[i] + offset[i]);
     let request = ViewRequest {
-        eye_m,
-        look_at_m,
+        eye_m: at(from.eye_m),
+        look_at_m: at(from.look_at_m),
         width_px: 720,
         height_px: 540,
-        field_of_view_deg,
+        field_of_view_deg: from.field_of_view_deg,
     };
     let view: View = peer.ask(keys::SIM_TRUTH_VIEW, &request, limit).await?;
     Ok(view.image)

@@ -1,6 +1,7 @@
 //! A run as one self-contained page: numbers, pictures, plots, the effective scenario. The page
 //! refers to nothing outside of itself.
 
+mod bullseye;
 mod picture;
 mod plot;
 mod timeline;
@@ -120,7 +121,7 @@ fn cards(report: &RunReport) -> String {
         "Predicted",
         &number(predicted, 2),
         "mm",
-        "before contact, one sigma",
+        "before contact, 95 % bound",
     );
     cards += &card(
         "Open loop",
@@ -283,7 +284,7 @@ fn servo(report: &RunReport, evidence: &Evidence) -> String {
             .collect::<Vec<_>>()
     };
     charts += &Plot {
-        title: "Predicted lateral error at the target, one sigma",
+        title: "Predicted lateral error at the target, 95 % bound",
         x_label: "look",
         y_label: "mm",
         whole_x: true,
@@ -292,19 +293,6 @@ fn servo(report: &RunReport, evidence: &Evidence) -> String {
             name: "predicted",
             colour: PURPLE,
             points: over_looks(&|l| l.predicted_error_m * 1e3),
-        }],
-    }
-    .svg();
-    charts += &Plot {
-        title: "Distance from the target along its normal",
-        x_label: "look",
-        y_label: "mm",
-        whole_x: true,
-        from_zero: true,
-        series: vec![Series {
-            name: "station",
-            colour: BLUE,
-            points: over_looks(&|l| l.station_m * 1e3),
         }],
     }
     .svg();
@@ -435,7 +423,19 @@ fn truth(report: &RunReport, evidence: &Evidence) -> String {
         );
         row("Peak force", Some(contact.peak_force_n), "N", "axial");
     }
-    format!("<table class=\"wide\">{rows}</table>")
+    let predicted_mm = report.servo.as_ref().map(|s| s.predicted_error_mm);
+    let drawn = evidence
+        .score
+        .as_ref()
+        .and_then(|score| bullseye::bullseye(score, predicted_mm));
+    let drawn = drawn.map_or(String::new(), |svg| {
+        format!(
+            "<figure>{svg}<figcaption>Contact (blue) and the true point at the designated pixel \
+             (cross), seen along the true normal; dashed: predicted to hold it in 95 % of \
+             cases.</figcaption></figure>"
+        )
+    });
+    format!("<div class=\"truth\"><table>{rows}</table>{drawn}</div>")
 }
 
 /// Text as HTML.

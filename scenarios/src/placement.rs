@@ -143,7 +143,11 @@ impl<'a> Mission<'a> {
         if ended.is_err() {
             self.stop_arm().await;
         }
-        let scoring = self.peer.is_present(keys::service::HARDWARE).await.unwrap_or(false);
+        let scoring = self
+            .peer
+            .is_present(keys::service::HARDWARE)
+            .await
+            .unwrap_or(false);
         if let Some(target) = record.target.clone().filter(|_| scoring) {
             let scored = self.score(&target).await;
             match scored {

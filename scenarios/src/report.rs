@@ -107,7 +107,7 @@ pub struct ServoReport {
     pub error_vectors_mm: Vec<Option<[f64; 3]>>,
     /// Whether the fiducial was found, at each look.
     pub fiducial_found: Vec<bool>,
-    /// Predicted lateral error of the placement, one sigma, mm.
+    /// Predicted lateral error of the placement, 95 % bound, mm.
     pub predicted_error_mm: f64,
 }
 

@@ -79,7 +79,7 @@ pub struct ServoSettings {
     pub tolerance_mm: f64,
     /// At the standoff: at most so many corrections.
     pub max_corrections_n: u32,
-    /// Refuse to go on when the predicted lateral error (one sigma) exceeds this, mm.
+    /// Refuse to go on when the predicted lateral error (95 % bound) exceeds this, mm.
     pub max_predicted_error_mm: f64,
 }
 

@@ -9,7 +9,12 @@ use std::{
 
 fn rover(folder: &Path, args: &[&str]) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_rover"));
-    command.args(args).current_dir(folder).env_remove("RUST_LOG").output().unwrap()
+    command
+        .args(args)
+        .current_dir(folder)
+        .env_remove("RUST_LOG")
+        .output()
+        .unwrap()
 }
 
 fn elsewhere() -> tempfile::TempDir {
@@ -24,9 +29,16 @@ fn refused(args: &[&str], parts: &[&str]) {
     let out = rover(elsewhere().path(), args);
     let stderr = text(&out.stderr);
     assert_eq!(out.status.code(), Some(2), "{args:?}: {stderr}");
-    assert!(out.stdout.is_empty(), "{args:?} wrote data: {}", text(&out.stdout));
+    assert!(
+        out.stdout.is_empty(),
+        "{args:?} wrote data: {}",
+        text(&out.stdout)
+    );
     for part in parts {
-        assert!(stderr.contains(part), "{args:?}: `{part}` is missing in: {stderr}");
+        assert!(
+            stderr.contains(part),
+            "{args:?}: `{part}` is missing in: {stderr}"
+        );
     }
 }
 
@@ -36,13 +48,23 @@ fn help_names_what_works_and_nothing_else() {
     assert_eq!(out.status.code(), Some(0));
     let help = text(&out.stdout);
     for verb in ["run", "up", "service", "inspect", "doctor"] {
-        assert!(help.lines().any(|l| l.trim_start().starts_with(verb)), "{verb}: {help}");
+        assert!(
+            help.lines().any(|l| l.trim_start().starts_with(verb)),
+            "{verb}: {help}"
+        );
     }
     let out = rover(elsewhere().path(), &["run", "--help"]);
     let help = text(&out.stdout);
-    for flag in
-        ["--seed", "--set", "--json", "--report", "--processes", "--realtime", "--force", "--print"]
-    {
+    for flag in [
+        "--seed",
+        "--set",
+        "--json",
+        "--report",
+        "--processes",
+        "--realtime",
+        "--force",
+        "--print",
+    ] {
         assert!(help.contains(flag), "{flag}: {help}");
     }
     assert!(!help.contains("--record"), "{help}");
@@ -50,7 +72,10 @@ fn help_names_what_works_and_nothing_else() {
 
 #[test]
 fn an_installed_binary_prints_the_default_scenario_in_any_folder() {
-    let out = rover(elsewhere().path(), &["run", "--print", "--set", "servo.method=epec"]);
+    let out = rover(
+        elsewhere().path(),
+        &["run", "--print", "--set", "servo.method=epec"],
+    );
     assert_eq!(out.status.code(), Some(0), "{}", text(&out.stderr));
     let printed = text(&out.stdout);
     assert!(printed.contains("method = \"epec\""), "{printed}");
@@ -69,14 +94,29 @@ fn a_printed_scenario_can_be_run_as_ones_own() {
 
 #[test]
 fn bad_input_ends_with_2_and_says_what_where_and_what_was_expected() {
-    refused(&["run", "nowhere.toml"], &["nowhere.toml", "scenarios/bluestreak.toml"]);
-    refused(&["run", "--set", "servo.tolerance=1"], &["servo.tolerance_mm"]);
-    refused(&["run", "--set", "servo.tolerance_mm=-1"], &["expected 0.001 to 100"]);
+    refused(
+        &["run", "nowhere.toml"],
+        &["nowhere.toml", "scenarios/bluestreak.toml"],
+    );
+    refused(
+        &["run", "--set", "servo.tolerance=1"],
+        &["servo.tolerance_mm"],
+    );
+    refused(
+        &["run", "--set", "servo.tolerance_mm=-1"],
+        &["expected 0.001 to 100"],
+    );
     refused(&["run", "--seed", "minus"], &["--seed", "minus"]);
     refused(&["run", "--record", "x.mcap"], &["--record"]);
     refused(&["fly"], &["fly"]);
-    refused(&["service", "epec"], &["no service named `epec`", "epec_servo", "rover_sim"]);
-    refused(&["service", "arm_planner", "--robot", "no.toml"], &["no.toml", "bluestreak.toml"]);
+    refused(
+        &["service", "epec"],
+        &["no service named `epec`", "epec_servo", "rover_sim"],
+    );
+    refused(
+        &["service", "arm_planner", "--robot", "no.toml"],
+        &["no.toml", "bluestreak.toml"],
+    );
     refused(&["inspect", "a//b", "--once"], &["KEYEXPR"]);
     refused(
         &["inspect", "--once", "--connect", "tcp/127.0.0.1:1"],
@@ -87,7 +127,11 @@ fn bad_input_ends_with_2_and_says_what_where_and_what_was_expected() {
 #[test]
 fn a_broken_file_is_refused_with_its_line() {
     let folder = elsewhere();
-    std::fs::write(folder.path().join("broken.toml"), "name = \"x\"\nrobot = 5\n").unwrap();
+    std::fs::write(
+        folder.path().join("broken.toml"),
+        "name = \"x\"\nrobot = 5\n",
+    )
+    .unwrap();
     let out = rover(folder.path(), &["run", "broken.toml"]);
     let stderr = text(&out.stderr);
     assert_eq!(out.status.code(), Some(2), "{stderr}");
@@ -105,9 +149,16 @@ fn existing_outputs_are_refused_before_anything_runs() {
     for args in [["run", "--json", "out.json"], ["run", "--report", "page"]] {
         let out = rover(folder.path(), &args);
         assert_eq!(out.status.code(), Some(2), "{}", text(&out.stderr));
-        assert!(text(&out.stderr).contains("--force"), "{}", text(&out.stderr));
+        assert!(
+            text(&out.stderr).contains("--force"),
+            "{}",
+            text(&out.stderr)
+        );
     }
-    assert_eq!(std::fs::read_to_string(folder.path().join("out.json")).unwrap(), "mine");
+    assert_eq!(
+        std::fs::read_to_string(folder.path().join("out.json")).unwrap(),
+        "mine"
+    );
 }
 
 #[test]
@@ -121,6 +172,10 @@ fn the_doctor_reports_every_check_with_a_remedy_for_what_is_wrong() {
         assert!(checks.contains(&check), "{check}: {checks:?}");
     }
     for finding in all {
-        assert_eq!(finding["state"] == "ok", finding["remedy"].is_null(), "{finding}");
+        assert_eq!(
+            finding["state"] == "ok",
+            finding["remedy"].is_null(),
+            "{finding}"
+        );
     }
 }

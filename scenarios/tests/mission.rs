@@ -114,9 +114,13 @@ async fn network(name: &str, script: Script) -> Network {
     let open = |name: &'static str, role, connect: Vec<String>| {
         Peer::open(NetworkConfig::new(&namespace, name, role, &connect))
     };
-    let hardware = open(service::HARDWARE, Role::Simulator, vec![]).await.unwrap();
+    let hardware = open(service::HARDWARE, Role::Simulator, vec![])
+        .await
+        .unwrap();
     let mut endpoints = hardware.locators().await;
-    let others = open("others", Role::Service, endpoints.clone()).await.unwrap();
+    let others = open("others", Role::Service, endpoints.clone())
+        .await
+        .unwrap();
     endpoints.extend(others.locators().await);
     let runner = open(RUNNER, Role::Runner, endpoints).await.unwrap();
 
@@ -142,7 +146,9 @@ async fn network(name: &str, script: Script) -> Network {
         w.note("score");
         async move {
             assert_eq!(request.target, target());
-            let open_loop = request.open_loop_joints_rad.expect("the target is in reach");
+            let open_loop = request
+                .open_loop_joints_rad
+                .expect("the target is in reach");
             assert_eq!(open_loop.len(), 5);
             Ok(Score {
                 target_in_world_m: [0.57, 0.0, 0.39],
@@ -162,9 +168,16 @@ async fn network(name: &str, script: Script) -> Network {
     let select = others.serve(keys::TARGET_SELECT, move |request: SelectRequest| {
         w.note("select");
         async move {
-            assert_eq!((request.pair.as_str(), request.pixel_px), ("body", [340.0, 236.0]));
+            assert_eq!(
+                (request.pair.as_str(), request.pixel_px),
+                ("body", [340.0, 236.0])
+            );
             if script == Script::RefuseTarget {
-                return Err(Fault::new("target_selection", "no_texture", "nothing to match"));
+                return Err(Fault::new(
+                    "target_selection",
+                    "no_texture",
+                    "nothing to match",
+                ));
             }
             Ok(target())
         }
@@ -173,7 +186,13 @@ async fn network(name: &str, script: Script) -> Network {
     let w = world.clone();
     let survey = others.serve(keys::PLANNER_SURVEY, move |_: SurveyRequest| {
         w.note("survey");
-        async move { Ok(SurveyReport { points_n: 9, cells_n: 9, cell_m: 0.01 }) }
+        async move {
+            Ok(SurveyReport {
+                points_n: 9,
+                cells_n: 9,
+                cell_m: 0.01,
+            })
+        }
     });
     served.push(survey.await.unwrap());
     let w = world.clone();
@@ -185,8 +204,11 @@ async fn network(name: &str, script: Script) -> Network {
             let w = w.clone();
             async move {
                 let fail = |name: &str| Err(Fault::new("epec_servo", name, "as told"));
-                let feedback =
-                    PlaceFeedback { activity: "moving".into(), distance_m: 0.1, look: None };
+                let feedback = PlaceFeedback {
+                    activity: "moving".into(),
+                    distance_m: 0.1,
+                    look: None,
+                };
                 context.feedback(feedback);
                 w.pass(10.0);
                 match script {
@@ -216,7 +238,10 @@ async fn network(name: &str, script: Script) -> Network {
             w.note("contact");
             let w = w.clone();
             async move {
-                assert_eq!(goal.compensation, Compensation::constant([0.001, -0.002, 0.003]));
+                assert_eq!(
+                    goal.compensation,
+                    Compensation::constant([0.001, -0.002, 0.003])
+                );
                 w.pass(6.0);
                 if script == Script::NoContact {
                     let message = "no surface within 20 mm";
@@ -235,7 +260,12 @@ async fn network(name: &str, script: Script) -> Network {
         },
     );
     served.push(contact.await.unwrap());
-    Network { world, runner, _served: served, _peers: vec![hardware, others] }
+    Network {
+        world,
+        runner,
+        _served: served,
+        _peers: vec![hardware, others],
+    }
 }
 
 async fn run(network: &Network, abort: Abort) -> RunReport {
@@ -258,7 +288,11 @@ fn asked(network: &Network) -> Vec<&'static str> {
 }
 
 fn phases(report: &RunReport) -> Vec<(&str, f64, &str)> {
-    report.phases.iter().map(|p| (p.name.as_str(), p.sim_s, p.outcome.as_str())).collect()
+    report
+        .phases
+        .iter()
+        .map(|p| (p.name.as_str(), p.sim_s, p.outcome.as_str()))
+        .collect()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -266,7 +300,10 @@ async fn a_placement_asks_in_order_and_reports_everything() {
     let network = network("placed", Script::Normal).await;
     let report = run(&network, Abort::default()).await;
     assert_eq!(report.outcome, Outcome::Placed, "{:?}", report.reason);
-    assert_eq!(asked(&network), ["select", "survey", "place", "contact", "score"]);
+    assert_eq!(
+        asked(&network),
+        ["select", "survey", "place", "contact", "score"]
+    );
     assert_eq!(
         phases(&report),
         [
@@ -298,7 +335,10 @@ async fn a_refused_target_ends_the_run_before_the_arm_moves() {
     let network = network("refused", Script::RefuseTarget).await;
     let report = run(&network, Abort::default()).await;
     assert_eq!(report.outcome, Outcome::Aborted);
-    assert_eq!(report.reason.as_deref(), Some("no_texture: nothing to match"));
+    assert_eq!(
+        report.reason.as_deref(),
+        Some("no_texture: nothing to match")
+    );
     assert_eq!(asked(&network), ["select"]);
     assert_eq!(phases(&report), [("designate", 0.0, "no_texture")]);
     assert!(report.target.is_none() && report.servo.is_none() && report.truth.is_none());
@@ -308,9 +348,15 @@ async fn a_refused_target_ends_the_run_before_the_arm_moves() {
 async fn a_failed_servo_stops_the_arm_and_is_still_scored() {
     let network = network("servo", Script::ServoFails).await;
     let report = run(&network, Abort::default()).await;
-    assert_eq!(report.reason.as_deref(), Some("predicted_error_too_large: as told"));
+    assert_eq!(
+        report.reason.as_deref(),
+        Some("predicted_error_too_large: as told")
+    );
     assert_eq!(asked(&network), ["select", "survey", "place", "score"]);
-    assert_eq!(phases(&report)[2], ("servo", 10.0, "predicted_error_too_large"));
+    assert_eq!(
+        phases(&report)[2],
+        ("servo", 10.0, "predicted_error_too_large")
+    );
     assert!(report.servo.is_none() && report.contact.is_none());
     assert!(report.truth.is_some());
     assert_eq!(network.world.stops.load(Ordering::SeqCst), 1);
@@ -321,7 +367,10 @@ async fn a_missed_surface_is_an_aborted_run_that_says_so() {
     let network = network("missed", Script::NoContact).await;
     let report = run(&network, Abort::default()).await;
     assert_eq!(report.outcome, Outcome::Aborted);
-    assert_eq!(report.reason.as_deref(), Some("no_contact: no surface within 20 mm"));
+    assert_eq!(
+        report.reason.as_deref(),
+        Some("no_contact: no surface within 20 mm")
+    );
     assert!(report.servo.is_some() && report.contact.is_none());
 }
 
@@ -335,12 +384,19 @@ async fn an_abort_cancels_what_runs_and_its_reason_is_the_runs() {
             while !world.asked.lock().unwrap().contains(&"place") {
                 tokio::task::yield_now().await;
             }
-            abort.now(Fault::new(RUNNER, "service_lost", "arm_planner has left the network"));
+            abort.now(Fault::new(
+                RUNNER,
+                "service_lost",
+                "arm_planner has left the network",
+            ));
             abort.now(Fault::new(RUNNER, "interrupted", "comes too late"));
         }
     };
     let (report, ()) = tokio::join!(run(&network, abort), later);
-    assert_eq!(report.reason.as_deref(), Some("service_lost: arm_planner has left the network"));
+    assert_eq!(
+        report.reason.as_deref(),
+        Some("service_lost: arm_planner has left the network")
+    );
     assert_eq!(phases(&report)[2].2, "service_lost");
     assert_eq!(network.world.stops.load(Ordering::SeqCst), 1);
 }

@@ -72,15 +72,29 @@ fn the_json_has_exactly_the_fields_of_the_interface() {
             "servo", "target", "truth"
         ]
     );
-    assert_eq!(keys(&value["phases"][0]), ["name", "outcome", "sim_s", "wall_s"]);
+    assert_eq!(
+        keys(&value["phases"][0]),
+        ["name", "outcome", "sim_s", "wall_s"]
+    );
     assert_eq!(
         keys(&value["target"]),
-        ["normal", "pair", "pixel_px", "plane_rms_mm", "position_m", "sigma_mm"]
+        [
+            "normal",
+            "pair",
+            "pixel_px",
+            "plane_rms_mm",
+            "position_m",
+            "sigma_mm"
+        ]
     );
     assert_eq!(
         keys(&value["servo"]),
         [
-            "converged", "error_vectors_mm", "fiducial_found", "iterations", "method",
+            "converged",
+            "error_vectors_mm",
+            "fiducial_found",
+            "iterations",
+            "method",
             "predicted_error_mm"
         ]
     );
@@ -91,13 +105,19 @@ fn the_json_has_exactly_the_fields_of_the_interface() {
     assert_eq!(
         keys(&value["truth"]),
         [
-            "arm_model_error_mm", "axis_error_deg", "lateral_error_mm",
-            "open_loop_lateral_error_mm", "range_error_mm"
+            "arm_model_error_mm",
+            "axis_error_deg",
+            "lateral_error_mm",
+            "open_loop_lateral_error_mm",
+            "range_error_mm"
         ]
     );
     assert_eq!(value["outcome"], "placed");
     assert_eq!(value["reason"], Value::Null);
-    assert_eq!(value["servo"]["error_vectors_mm"], json!([[1.0, -2.0, 0.1], null]));
+    assert_eq!(
+        value["servo"]["error_vectors_mm"],
+        json!([[1.0, -2.0, 0.1], null])
+    );
     let back: RunReport = serde_json::from_value(value).unwrap();
     assert_eq!(back, report());
 }
@@ -108,7 +128,7 @@ fn the_digest_is_the_same_on_every_machine() {
     assert_eq!(report().digest, GOLDEN);
 }
 
-const GOLDEN: &str = "GOLDEN_DIGEST";
+const GOLDEN: &str = "0b0060d8eb2f8c12dc11193af91db4d72f0a9ff699f1c154da265e8e1bab0f13";
 
 #[test]
 fn wall_times_do_not_change_the_digest_and_anything_else_does() {
@@ -144,7 +164,7 @@ fn the_summary_gives_outcome_and_numbers_with_units() {
         "bluestreak: placed",
         "0.350 mm",
         "14.200 mm",
-        "0.40 mm (1 sigma)",
+        "0.40 mm (95 %)",
         "fiducial found in 1",
         "3.2 N",
         "12.5 s simulated",
@@ -156,6 +176,9 @@ fn the_summary_gives_outcome_and_numbers_with_units() {
     aborted.reason = Some("no_contact: no surface".into());
     aborted.truth.as_mut().unwrap().lateral_error_mm = None;
     let text = aborted.summary();
-    assert!(text.contains("aborted") && text.contains("no_contact: no surface"), "{text}");
+    assert!(
+        text.contains("aborted") && text.contains("no_contact: no surface"),
+        "{text}"
+    );
     assert!(text.contains("lateral error          none"), "{text}");
 }

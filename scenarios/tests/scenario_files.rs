@@ -43,8 +43,11 @@ fn defaults_fill_everything_but_name_robot_and_target() {
     assert_eq!(scenario.servo.observation, Observation::Pose);
     assert_eq!(scenario.arm.start_posture, "stow");
     for field in ["name", "robot", "target"] {
-        let without: String =
-            SMALL.lines().filter(|l| !l.starts_with(field)).collect::<Vec<_>>().join("\n");
+        let without: String = SMALL
+            .lines()
+            .filter(|l| !l.starts_with(field))
+            .collect::<Vec<_>>()
+            .join("\n");
         let without = without.replace("[target]", "");
         assert!(Scenario::parse(&without, "x").is_err(), "{field}");
     }
@@ -54,17 +57,30 @@ fn defaults_fill_everything_but_name_robot_and_target() {
 fn the_printed_scenario_is_the_effective_one_and_reads_back() {
     let loaded = load(&["servo.tolerance_mm=0.25", "simulation.truth.angle_deg=0.5"]).unwrap();
     let printed = loaded.scenario.to_toml().unwrap();
-    assert_eq!(Scenario::parse(&printed, "printed").unwrap(), loaded.scenario);
+    assert_eq!(
+        Scenario::parse(&printed, "printed").unwrap(),
+        loaded.scenario
+    );
     assert!(printed.contains("tolerance_mm = 0.25"));
     assert!(printed.contains("max_force_n = "), "defaults are filled in");
-    assert!(printed.contains("# Largest axial force, N."), "fields are explained");
+    assert!(
+        printed.contains("# Largest axial force, N."),
+        "fields are explained"
+    );
 }
 
 #[test]
 fn an_unknown_field_is_refused_with_file_line_and_the_known_names() {
     let text = SMALL.replace("pixel_px", "pixel");
-    let error = Scenario::parse(&text, "small.toml").unwrap_err().to_string();
-    for part in ["small.toml", "line 6", "unknown field `pixel`", "`pixel_px`"] {
+    let error = Scenario::parse(&text, "small.toml")
+        .unwrap_err()
+        .to_string();
+    for part in [
+        "small.toml",
+        "line 6",
+        "unknown field `pixel`",
+        "`pixel_px`",
+    ] {
         assert!(error.contains(part), "`{part}` is missing in: {error}");
     }
 }
@@ -72,8 +88,16 @@ fn an_unknown_field_is_refused_with_file_line_and_the_known_names() {
 #[test]
 fn a_wrong_type_is_refused_with_line_found_and_expected() {
     let text = SMALL.to_owned() + "[contact]\nmax_force_n = \"much\"\n";
-    let error = Scenario::parse(&text, "small.toml").unwrap_err().to_string();
-    for part in ["small.toml", "line 8", "max_force_n", "\"much\"", "expected f64"] {
+    let error = Scenario::parse(&text, "small.toml")
+        .unwrap_err()
+        .to_string();
+    for part in [
+        "small.toml",
+        "line 8",
+        "max_force_n",
+        "\"much\"",
+        "expected f64",
+    ] {
         assert!(error.contains(part), "`{part}` is missing in: {error}");
     }
 }
@@ -81,17 +105,35 @@ fn a_wrong_type_is_refused_with_line_found_and_expected() {
 #[test]
 fn a_value_out_of_range_names_field_value_and_range() {
     for (set, parts) in [
-        ("servo.tolerance_mm=0", ["servo.tolerance_mm", "0, expected 0.001 to 100"]),
-        ("servo.stations_m=[0.03, 0.06]", ["servo.stations_m", "expected far to near"]),
-        ("servo.stations_m=[]", ["servo.stations_m", "empty, expected at least one"]),
-        ("target.pixel_px=[640, 10]", ["target.pixel_px (u)", "640, expected -0.5 to 639.5"]),
+        (
+            "servo.tolerance_mm=0",
+            ["servo.tolerance_mm", "0, expected 0.001 to 100"],
+        ),
+        (
+            "servo.stations_m=[0.03, 0.06]",
+            ["servo.stations_m", "expected far to near"],
+        ),
+        (
+            "servo.stations_m=[]",
+            ["servo.stations_m", "empty, expected at least one"],
+        ),
+        (
+            "target.pixel_px=[640, 10]",
+            ["target.pixel_px (u)", "640, expected -0.5 to 639.5"],
+        ),
         ("target.pair=mast", ["target.pair", "the robot has: body"]),
-        ("arm.start_posture=fold", ["arm.start_posture", "the robot has: ready, stow"]),
+        (
+            "arm.start_posture=fold",
+            ["arm.start_posture", "the robot has: ready, stow"],
+        ),
         ("limits.start_s=nan", ["limits.start_s", "NaN, expected"]),
     ] {
         let error = message(&[set]);
         for part in parts {
-            assert!(error.contains(part), "{set}: `{part}` is missing in: {error}");
+            assert!(
+                error.contains(part),
+                "{set}: `{part}` is missing in: {error}"
+            );
         }
     }
 }
@@ -123,20 +165,32 @@ fn a_mistyped_path_is_refused_with_the_nearest_names() {
         ("servo.toleranc_mm=1", "`servo.tolerance_mm`"),
         ("sevo.tolerance_mm=1", "`servo.tolerance_mm`"),
         ("tolerance_mm=1", "`servo.tolerance_mm`"),
-        ("simulation.truth.angel_deg=1", "`simulation.truth.angle_deg`"),
-        ("simulation.terrain.rocks.99.radius_m=1", "they count from 0"),
+        (
+            "simulation.truth.angel_deg=1",
+            "`simulation.truth.angle_deg`",
+        ),
+        (
+            "simulation.terrain.rocks.99.radius_m=1",
+            "they count from 0",
+        ),
         ("servo.method.name=epec", "has no fields"),
     ] {
         let error = message(&[set]);
         assert!(error.starts_with(&format!("--set {set}: ")), "{error}");
-        assert!(error.contains(nearest), "{set}: {nearest} is missing in: {error}");
+        assert!(
+            error.contains(nearest),
+            "{set}: {nearest} is missing in: {error}"
+        );
     }
 }
 
 #[test]
 fn a_value_that_does_not_fit_is_refused_with_what_was_expected() {
     for (set, part) in [
-        ("servo.method=fancy", "expected one of `kinematic`, `epec`, `epec_field`"),
+        (
+            "servo.method=fancy",
+            "expected one of `kinematic`, `epec`, `epec_field`",
+        ),
         ("servo.tolerance_mm=true", "expected f64"),
         ("servo.tolerance_mm=1 2", "is not a TOML value"),
         ("servo.tolerance_mm", "expected PATH=VALUE"),
@@ -144,7 +198,10 @@ fn a_value_that_does_not_fit_is_refused_with_what_was_expected() {
         ("servo.method=", "expected PATH=VALUE"),
     ] {
         let error = message(&[set]);
-        assert!(error.contains(part), "{set}: `{part}` is missing in: {error}");
+        assert!(
+            error.contains(part),
+            "{set}: `{part}` is missing in: {error}"
+        );
     }
 }
 
@@ -167,7 +224,9 @@ fn a_file_on_disk_wins_and_finds_the_shipped_robot() {
 
     let robots = folder.path().join("robots");
     std::fs::create_dir(&robots).unwrap();
-    let mine = loaded.robot_text.replace("name = \"bluestreak\"", "name = \"mine\"");
+    let mine = loaded
+        .robot_text
+        .replace("name = \"bluestreak\"", "name = \"mine\"");
     std::fs::write(robots.join("bluestreak.toml"), mine).unwrap();
     let loaded = LoadedScenario::load(path.to_str().unwrap(), &[], None).unwrap();
     assert_eq!(loaded.robot.name(), "mine");
@@ -175,6 +234,11 @@ fn a_file_on_disk_wins_and_finds_the_shipped_robot() {
 
 #[test]
 fn a_scenario_that_is_nowhere_lists_what_there_is() {
-    let error = LoadedScenario::load("nowhere.toml", &[], None).unwrap_err().to_string();
-    assert!(error.contains("nowhere.toml") && error.contains("scenarios/bluestreak.toml"), "{error}");
+    let error = LoadedScenario::load("nowhere.toml", &[], None)
+        .unwrap_err()
+        .to_string();
+    assert!(
+        error.contains("nowhere.toml") && error.contains("scenarios/bluestreak.toml"),
+        "{error}"
+    );
 }

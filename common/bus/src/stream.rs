@@ -441,14 +441,12 @@ impl Peer {
         // The stream is open but empty. Subscribe, then ask again for what came in between.
         let mut watcher = self.watch::<T>(key).await?;
         let left = deadline.saturating_duration_since(Instant::now());
-        let second = self.read_latest(key, left).await;
-        if second.as_ref().err().and_then(BusError::fault_name) != Some("no_value_yet") {
-            return second;
+        match self.read_latest(key, left).await {
+            Err(BusError::Timeout { .. } | BusError::NoAnswer { .. }) => return first,
+            Err(BusError::Fault(fault)) if fault.name == "no_value_yet" => {}
+            other => return other,
         }
-        match timeout_at(deadline, watcher.next()).await {
-            Ok(value) => value,
-            Err(_) => second,
-        }
+        timeout_at(deadline, watcher.next()).await.unwrap_or(first)
     }
 
     async fn read_latest<T: Wire>(&self, key: &str, limit: Duration) -> Result<T, BusError> {

@@ -87,6 +87,7 @@ pub fn tangent_basis(normal: &Unit<Vector3<f64>>) -> (Vector3<f64>, Vector3<f64>
 
 #[cfg(test)]
 mod tests {
+    #![allow(clippy::unwrap_used, clippy::expect_used)]
     use super::*;
 
     #[test]

@@ -18,7 +18,10 @@ fn the_shipped_robot_is_whole_and_keeps_its_hash() {
     let baseline = a.pair("body").unwrap().cameras.baseline_m();
     assert!((baseline - 0.08).abs() < 1e-12);
     // Pointing down over the workspace, the fiducial faces back and up, towards the cameras.
-    let link = a.rover_from_link(a.posture("ready").unwrap()).unwrap().isometry;
+    let link = a
+        .rover_from_link(a.posture("ready").unwrap())
+        .unwrap()
+        .isometry;
     let normal = link * a.link_from_plate * nalgebra::Vector3::z();
     assert!(normal.x < -0.6 && normal.z > 0.6, "{normal}");
 }
@@ -26,14 +29,42 @@ fn the_shipped_robot_is_whole_and_keeps_its_hash() {
 #[test]
 fn mistakes_are_named_with_field_and_expectation() {
     for (from, to, expected) in [
-        ("heartbeat_s = 0.02", "heartbeat_ms = 20", "unknown field `heartbeat_ms`"),
-        ("heartbeat_s = 0.02", "heartbeat_s = 2.0", "arm.heartbeat_s: 2, expected at most 0.05"),
-        ("tip_m = [0.0, 0.0, 0.1306]", "tip_m = [0.0, 0.1306]", "tip_m"),
-        ("angle_deg = 1.0", "angle_deg = -1.0", "model_quality.angle_deg: -1, expected a positive"),
-        ("travel_m = 0.004", "travel_m = 0.001", "tool.switch.travel_m: 0.001, expected more than"),
+        (
+            "heartbeat_s = 0.02",
+            "heartbeat_ms = 20",
+            "unknown field `heartbeat_ms`",
+        ),
+        (
+            "heartbeat_s = 0.02",
+            "heartbeat_s = 2.0",
+            "arm.heartbeat_s: 2, expected at most 0.05",
+        ),
+        (
+            "tip_m = [0.0, 0.0, 0.1306]",
+            "tip_m = [0.0, 0.1306]",
+            "tip_m",
+        ),
+        (
+            "angle_deg = 1.0",
+            "angle_deg = -1.0",
+            "model_quality.angle_deg: -1, expected a positive",
+        ),
+        (
+            "travel_m = 0.004",
+            "travel_m = 0.001",
+            "tool.switch.travel_m: 0.001, expected more than",
+        ),
         ("stow = [-1.5,", "stow = [-3.5,", "shoulder_azimuth"),
-        ("name = \"bluestreak\"", "name = \"Blue/streak\"", "name: `Blue/streak`, expected lower"),
-        ("axis = [0.0, 0.0, 1.0]", "axis = [0.0, 0.0, 0.0]", "tool.axis"),
+        (
+            "name = \"bluestreak\"",
+            "name = \"Blue/streak\"",
+            "name: `Blue/streak`, expected lower",
+        ),
+        (
+            "axis = [0.0, 0.0, 1.0]",
+            "axis = [0.0, 0.0, 0.0]",
+            "tool.axis",
+        ),
     ] {
         let message = parse(from, to).unwrap_err().to_string();
         assert!(message.contains(expected), "`{to}` gave: {message}");
@@ -45,5 +76,8 @@ fn mistakes_are_named_with_field_and_expectation() {
 fn an_unknown_name_is_answered_with_the_known_ones() {
     let robot = Robot::parse(BLUESTREAK, "bluestreak.toml").unwrap();
     let message = robot.posture("home").unwrap_err().to_string();
-    assert_eq!(message, "no posture named `home`; the robot has: ready, stow");
+    assert_eq!(
+        message,
+        "no posture named `home`; the robot has: ready, stow"
+    );
 }

@@ -415,7 +415,10 @@ unsafe fn dots_avx2(template: &Template, image: &SearchImage, start: usize, out:
         _mm_setzero_si128, _mm_shuffle_epi32, _mm256_add_epi32, _mm256_castsi256_si128,
         _mm256_extracti128_si256, _mm256_loadu_si256, _mm256_madd_epi16, _mm256_setzero_si256,
     };
-    let (wide, odd) = (template.stride / 16 * 16, template.stride % 16 != 0);
+    let (wide, odd) = (
+        template.stride / 16 * 16,
+        !template.stride.is_multiple_of(16),
+    );
     for (i, o) in out.iter_mut().enumerate() {
         // SAFETY: as the caller guarantees.
         unsafe {

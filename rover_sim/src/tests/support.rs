@@ -108,7 +108,7 @@ pub fn arm_model() -> ArmModel {
 }
 
 /// A posture with the instrument pointing down, its tip 0.15 m above the ground.
-pub const READY: [f64; 5] = [0.125, 0.1, 0.7, -2.371, -1.5708];
+pub const READY: [f64; 5] = [0.125, 0.1, 0.7, -2.371, -1.57];
 
 /// A square of ground, 2 m wide, of `2 * n * n` triangles, at height `z_m`.
 pub fn floor(z_m: f64, n: u32) -> (Vec<Vector3<f64>>, Vec<[u32; 3]>) {

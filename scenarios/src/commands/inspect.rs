@@ -17,7 +17,7 @@ use zenoh::{
 /// Shows what is on the network, decoded, as JSON lines; moves nothing
 #[derive(Clone, Debug, clap::Args)]
 pub struct InspectArgs {
-    /// Keys inside the robots' namespaces, e.g. arm/state or '*/status'
+    /// Keys inside the robot's namespace, e.g. arm/state or '*/status'
     #[arg(default_value = "**")]
     pub keyexpr: String,
     /// Writes the present values and ends, instead of following
@@ -26,7 +26,8 @@ pub struct InspectArgs {
     /// Endpoint of any one part
     #[arg(long, value_name = "ENDPOINT", default_value = "tcp/127.0.0.1:7447")]
     pub connect: Vec<String>,
-    /// Only this robot
+    /// Name of the robot, which is the namespace of its keys (default: bluestreak, or the
+    /// namespace of the file given with --zenoh)
     #[arg(long, value_name = "NAME")]
     pub robot: Option<String>,
     /// Zenoh configuration file (JSON5) in place of the defaults
@@ -34,6 +35,8 @@ pub struct InspectArgs {
     pub zenoh: Option<PathBuf>,
 }
 
+/// The robot that is looked at when none is named.
+const DEFAULT_ROBOT: &str = "bluestreak";
 /// Longest wait for the present values.
 const READ_LIMIT: Duration = Duration::from_secs(10);
 /// Samples that may wait to be written.
@@ -44,17 +47,27 @@ const WAITING: usize = 4096;
 /// # Errors
 /// [`CommandError`].
 pub async fn run(args: InspectArgs) -> Result<Exit, CommandError> {
-    let robots = args.robot.as_deref().unwrap_or("*");
     // A key without wildcard could be a command's: this one always has one.
-    let asked = if args.robot.is_some() && !args.keyexpr.contains('*') {
-        format!("{robots}/{}/**", args.keyexpr)
+    let asked = if args.keyexpr.contains('*') {
+        args.keyexpr.clone()
     } else {
-        format!("{robots}/{}", args.keyexpr)
+        format!("{}/**", args.keyexpr)
     };
-    let asked = KeyExpr::autocanonize(asked)
-        .map_err(|e| CommandError::BadInput(format!("KEYEXPR `{}`: {e}", args.keyexpr)))?;
+    let asked = KeyExpr::autocanonize(asked).map_err(|_| {
+        CommandError::BadInput(format!(
+            "KEYEXPR `{}`: expected names joined by single `/`, with `*` for any one and `**` \
+             for any number of them",
+            args.keyexpr
+        ))
+    })?;
     let name = format!("inspect-{}", std::process::id());
-    let mut config = NetworkConfig::new("", &name, Role::Client, &args.connect);
+    // Without a name the namespace is that of the network file.
+    let robot = match (&args.robot, &args.zenoh) {
+        (Some(robot), _) => robot.as_str(),
+        (None, Some(_)) => "",
+        (None, None) => DEFAULT_ROBOT,
+    };
+    let mut config = NetworkConfig::new(robot, &name, Role::Client, &args.connect);
     config.file = args.zenoh;
     let peer = Peer::open(config).await.map_err(|e| {
         CommandError::BadInput(format!(
@@ -77,7 +90,7 @@ async fn once(peer: &Peer, registry: &Registry, asked: &KeyExpr<'_>) -> Result<(
     let tokens = peer
         .session()
         .liveliness()
-        .get("*/presence/*")
+        .get("presence/*")
         .timeout(READ_LIMIT)
         .await
         .map_err(|e| anyhow!("presence: {e}"))?;
@@ -132,7 +145,7 @@ async fn follow(peer: &Peer, registry: &Registry, asked: &KeyExpr<'_>) -> Result
     let presence = peer
         .session()
         .liveliness()
-        .declare_subscriber("*/presence/*")
+        .declare_subscriber("presence/*")
         .history(true)
         .await
         .map_err(|e| anyhow!("presence: {e}"))?;

@@ -61,7 +61,7 @@ impl Mark {
         format!(
             "<g fill=\"none\" stroke=\"#000\" stroke-opacity=\".45\" stroke-width=\"4.5\">{shape}</g>\
              <g fill=\"none\" stroke=\"{0}\" stroke-width=\"2.2\">{shape}</g>\
-             <text x=\"{1}\" y=\"{2}\" class=\"mark\" fill=\"{0}\">{3}</text>",
+             <text x=\"{1}\" y=\"{2}\" class=\"mark\" style=\"fill:{0}\">{3}</text>",
             self.colour,
             u + 18.0,
             v - 12.0,

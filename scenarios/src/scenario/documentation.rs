@@ -38,7 +38,7 @@ const FIELDS: &[(&str, &str)] = &[
     ),
     (
         "servo.max_predicted_error_mm",
-        "Refuse to go on when the predicted lateral error (one sigma) exceeds this, mm.",
+        "Refuse to go on when the predicted lateral error (95 % bound) exceeds this, mm.",
     ),
     ("contact", "How contact is made."),
     ("contact.speed_mm_s", "Speed along the normal, mm/s."),

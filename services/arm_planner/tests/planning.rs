@@ -6,7 +6,7 @@
 use nalgebra::{Point3, Vector3};
 use proptest::prelude::*;
 use rover_arm_planner::Planner;
-use rover_geometry::{Direction, Point, Rover};
+use rover_geometry::{Direction, Point};
 use rover_kinematics::JointTrajectory;
 use rover_messages::planning::{Plan, PlanGoal, PlanRequest, ToolPose};
 use rover_robot::{Capsule, Robot};

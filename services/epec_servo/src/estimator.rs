@@ -46,6 +46,10 @@ impl Default for EstimatorRules {
 
 /// What was seen of the end-effector at known joint angles.
 #[derive(Clone, Debug, PartialEq)]
+#[allow(
+    clippy::large_enum_variant,
+    reason = "one at a time, never stored in bulk"
+)]
 pub enum Seen {
     /// Position of one point of the last link.
     Position {
@@ -214,7 +218,7 @@ impl Estimator {
         let distance2 = innovation.dot(&factor.solve(&innovation));
         let limit2 = self.rules.gate_per_row * observed.len() as f64;
         // A distance that is not a number is no agreement either.
-        if !(distance2 <= limit2) {
+        if distance2.is_nan() || distance2 > limit2 {
             return Err(EstimatorError::Inconsistent {
                 distance: distance2.sqrt(),
                 limit: limit2.sqrt(),

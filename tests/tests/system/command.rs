@@ -32,9 +32,15 @@ fn refused(arguments: &[&str], expected: &[&str]) {
     let message = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(2), "{arguments:?}: {message}");
     for word in expected {
-        assert!(message.contains(word), "{arguments:?} does not mention `{word}`: {message}");
+        assert!(
+            message.contains(word),
+            "{arguments:?} does not mention `{word}`: {message}"
+        );
     }
-    assert!(output.stdout.is_empty(), "{arguments:?} wrote to standard output");
+    assert!(
+        output.stdout.is_empty(),
+        "{arguments:?} wrote to standard output"
+    );
 }
 
 #[test]
@@ -44,8 +50,14 @@ fn a_mistyped_or_impossible_setting_is_refused_with_exit_2() {
         &["run", "--set", "servo.metod=\"epec\""],
         &["metod", "method"],
     );
-    refused(&["run", "--set", "contact.speed_mm_s=-1.0"], &["speed_mm_s", "-1"]);
-    refused(&["run", "--set", "target.pixel_px=[900.0, 20.0]"], &["pixel_px", "900"]);
+    refused(
+        &["run", "--set", "contact.speed_mm_s=-1.0"],
+        &["speed_mm_s", "-1"],
+    );
+    refused(
+        &["run", "--set", "target.pixel_px=[900.0, 20.0]"],
+        &["pixel_px", "900"],
+    );
     refused(&["run", "--set", "target.pair=\"mast\""], &["mast", "body"]);
 }
 
@@ -56,7 +68,10 @@ fn a_scenario_file_with_a_misspelt_field_is_refused_with_file_line_and_field() {
     let text = String::from_utf8(rover(&["run", "--print"]).stdout).unwrap();
     assert!(text.contains("pixel_px"));
     std::fs::write(&file, text.replace("pixel_px", "pixel_mm")).unwrap();
-    refused(&["run", file.to_str().unwrap()], &["mine.toml", "pixel_mm", "pixel_px", "line"]);
+    refused(
+        &["run", file.to_str().unwrap()],
+        &["mine.toml", "pixel_mm", "pixel_px", "line"],
+    );
 }
 
 #[test]
@@ -64,6 +79,9 @@ fn an_output_that_exists_is_kept_without_force() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("report.json");
     std::fs::write(&file, "precious").unwrap();
-    refused(&["run", "--json", file.to_str().unwrap()], &["report.json", "--force"]);
+    refused(
+        &["run", "--json", file.to_str().unwrap()],
+        &["report.json", "--force"],
+    );
     assert_eq!(std::fs::read_to_string(&file).unwrap(), "precious");
 }

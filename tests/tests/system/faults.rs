@@ -19,8 +19,13 @@ use std::{process::Command, time::Duration};
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn killing_the_servo_in_mid_motion_stops_the_arm_and_names_the_servo() {
     let loaded = LoadedScenario::load("scenarios/bluestreak.toml", &[], Some(3)).unwrap();
-    let mode = Mode::Processes { program: ROVER.into() };
-    let options = LaunchOptions { mode, ..LaunchOptions::default() };
+    let mode = Mode::Processes {
+        program: ROVER.into(),
+    };
+    let options = LaunchOptions {
+        mode,
+        ..LaunchOptions::default()
+    };
     let system = System::start(&loaded, &options).await.unwrap();
     let abort = Abort::default();
     let watching = system.watch_losses(abort.clone()).await.unwrap();
@@ -31,7 +36,11 @@ async fn killing_the_servo_in_mid_motion_stops_the_arm_and_names_the_servo() {
         .map(|(_, id)| id)
         .unwrap();
 
-    let mut states = system.peer().watch::<ArmState>(keys::ARM_STATE).await.unwrap();
+    let mut states = system
+        .peer()
+        .watch::<ArmState>(keys::ARM_STATE)
+        .await
+        .unwrap();
     let killer = tokio::spawn(async move {
         loop {
             let state = states.next().await.unwrap();
@@ -40,7 +49,10 @@ async fn killing_the_servo_in_mid_motion_stops_the_arm_and_names_the_servo() {
                 break;
             }
         }
-        let killed = Command::new("kill").args(["-KILL", &servo.to_string()]).status().unwrap();
+        let killed = Command::new("kill")
+            .args(["-KILL", &servo.to_string()])
+            .status()
+            .unwrap();
         assert!(killed.success());
     });
 
@@ -62,16 +74,27 @@ async fn killing_the_servo_in_mid_motion_stops_the_arm_and_names_the_servo() {
     assert!(reason.contains(keys::service::EPEC_SERVO), "{reason}");
 
     let limit = Duration::from_secs(30);
-    let status: ServiceStatus =
-        system.peer().latest(&keys::status(keys::service::HARDWARE), limit).await.unwrap();
-    let fault = status.last_fault.expect("the driver reports the lost commander");
+    let status: ServiceStatus = system
+        .peer()
+        .latest(&keys::status(keys::service::HARDWARE), limit)
+        .await
+        .unwrap();
+    let fault = status
+        .last_fault
+        .expect("the driver reports the lost commander");
     // Whichever comes first: the driver's own dead man, or the runner that sees the loss as well.
-    assert!(["commander_lost", "stopped"].contains(&fault.name.as_str()), "{fault}");
+    assert!(
+        ["commander_lost", "stopped"].contains(&fault.name.as_str()),
+        "{fault}"
+    );
     let since_ms = fault.details["since_last_beat_ms"];
     println!("at rest {since_ms} ms of simulated time after the last heartbeat");
     assert!(since_ms <= 100.0, "{since_ms} ms");
     let state: ArmState = system.peer().latest(keys::ARM_STATE, limit).await.unwrap();
     assert_eq!(state.motion, Motion::Idle);
-    assert!(state.rates_rad_s.iter().all(|r| r.abs() < 1e-3), "{state:?}");
+    assert!(
+        state.rates_rad_s.iter().all(|r| r.abs() < 1e-3),
+        "{state:?}"
+    );
     system.stop().await;
 }

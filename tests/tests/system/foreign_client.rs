@@ -19,7 +19,12 @@ struct Up {
 impl Up {
     fn start() -> Self {
         let mut child = Command::new(ROVER)
-            .args(["up", "scenarios/bluestreak.toml", "--listen", "tcp/127.0.0.1:0"])
+            .args([
+                "up",
+                "scenarios/bluestreak.toml",
+                "--listen",
+                "tcp/127.0.0.1:0",
+            ])
             .stdout(Stdio::piped())
             .stderr(Stdio::null())
             .spawn()
@@ -29,7 +34,11 @@ impl Up {
         let endpoint = lines
             .by_ref()
             .map_while(Result::ok)
-            .find_map(|line| line.split_whitespace().find(|w| w.starts_with("tcp/")).map(str::to_owned))
+            .find_map(|line| {
+                line.split_whitespace()
+                    .find(|w| w.starts_with("tcp/"))
+                    .map(str::to_owned)
+            })
             .expect("rover up names its endpoint");
         Self { child, endpoint }
     }
@@ -64,7 +73,10 @@ async fn ask(session: &Session, key: &str, payload: Option<Vec<u8>>) -> Result<V
         get = get.payload(payload).encoding("application/json");
     }
     let replies = get.await.unwrap();
-    let reply = replies.recv_async().await.unwrap_or_else(|_| panic!("{key} does not answer"));
+    let reply = replies
+        .recv_async()
+        .await
+        .unwrap_or_else(|_| panic!("{key} does not answer"));
     let parse = |bytes: &[u8]| serde_json::from_slice(bytes).expect("JSON");
     match reply.result() {
         Ok(sample) => Ok(parse(&sample.payload().to_bytes())),
@@ -86,10 +98,20 @@ async fn a_client_in_json_reads_selects_and_commands_and_mistakes_harm_nobody() 
 
     // Mistakes first: each is answered with a fault that has a name, and all goes on.
     let huge = vec![b' '; 17 << 20];
-    for key in ["target/select", "planner/plan", "servo/place", "servo/place/beat", "arm/execute"] {
-        let fault = ask(&session, key, Some(b"{\"pair\": 3".to_vec())).await.unwrap_err();
+    for key in [
+        "target/select",
+        "planner/plan",
+        "servo/place",
+        "servo/place/beat",
+        "arm/execute",
+    ] {
+        let fault = ask(&session, key, Some(b"{\"pair\": 3".to_vec()))
+            .await
+            .unwrap_err();
         assert_eq!(fault["name"], "bad_payload", "{key}: {fault}");
-        let unknown = tell(&session, key, json!({"colour": "red"})).await.unwrap_err();
+        let unknown = tell(&session, key, json!({"colour": "red"}))
+            .await
+            .unwrap_err();
         assert_eq!(unknown["name"], "bad_payload", "{key}: {unknown}");
     }
     if let Err(fault) = ask(&session, "target/select", Some(huge)).await {
@@ -106,7 +128,11 @@ async fn a_client_in_json_reads_selects_and_commands_and_mistakes_harm_nobody() 
     let pixel = scenario.target.pixel_px;
     let select = json!({"pair": "body", "pixel_px": pixel});
     let target = tell(&session, "target/select", select).await.unwrap();
-    assert_eq!(target["position_m"].as_array().unwrap().len(), 3, "{target}");
+    assert_eq!(
+        target["position_m"].as_array().unwrap().len(),
+        3,
+        "{target}"
+    );
     let current = ask(&session, "target/current", None).await.unwrap();
     assert_eq!(current, target);
 
@@ -120,7 +146,11 @@ async fn a_client_in_json_reads_selects_and_commands_and_mistakes_harm_nobody() 
     let order = |id: &str| json!({"goal_id": id, "commander": "visitor", "goal": goal});
     let absent = tell(&session, "servo/place", order("a")).await.unwrap_err();
     assert_eq!(absent["name"], "commander_absent", "{absent}");
-    let _token = session.liveliness().declare_token("bluestreak/presence/visitor").await.unwrap();
+    let _token = session
+        .liveliness()
+        .declare_token("bluestreak/presence/visitor")
+        .await
+        .unwrap();
     let accepted = tell(&session, "servo/place", order("b")).await.unwrap();
     assert_eq!(accepted["goal_id"], "b", "{accepted}");
     let second = tell(&session, "servo/place", order("c")).await.unwrap_err();
@@ -128,16 +158,30 @@ async fn a_client_in_json_reads_selects_and_commands_and_mistakes_harm_nobody() 
     let mut seq = 0;
     let end = loop {
         seq += 1;
-        let progress =
-            tell(&session, "servo/place/beat", json!({"goal_id": "b", "seq": seq})).await.unwrap();
+        let progress = tell(
+            &session,
+            "servo/place/beat",
+            json!({"goal_id": "b", "seq": seq}),
+        )
+        .await
+        .unwrap();
         let state = progress["state"].as_str().unwrap().to_owned();
         if state != "running" && state != "accepted" {
             break progress;
         }
     };
     assert_eq!(end["state"], "succeeded", "{end:#}");
-    assert!(end["result"]["looks"].as_array().unwrap().iter().all(|l| l["found"] == true), "{end:#}");
-    let kept = tell(&session, "servo/place/result", json!({"goal_id": "b"})).await.unwrap();
+    assert!(
+        end["result"]["looks"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .all(|l| l["found"] == true),
+        "{end:#}"
+    );
+    let kept = tell(&session, "servo/place/result", json!({"goal_id": "b"}))
+        .await
+        .unwrap();
     assert_eq!(kept["result"], end["result"]);
     session.close().await.unwrap();
 }

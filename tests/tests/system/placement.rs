@@ -4,7 +4,10 @@ use crate::command::run;
 use serde_json::Value;
 
 fn number(report: &Value, path: &str) -> f64 {
-    report.pointer(path).and_then(Value::as_f64).unwrap_or_else(|| panic!("no {path}: {report:#}"))
+    report
+        .pointer(path)
+        .and_then(Value::as_f64)
+        .unwrap_or_else(|| panic!("no {path}: {report:#}"))
 }
 
 #[test]
@@ -13,7 +16,11 @@ fn the_testbed_is_placed_within_its_budget_over_seeds() {
     let mut open_loop = Vec::new();
     for seed in 101..=108 {
         let (code, report) = run(&["scenarios/bluestreak.toml", "--seed", &seed.to_string()]);
-        assert_eq!((code, &report["outcome"]), (0, &Value::from("placed")), "{report:#}");
+        assert_eq!(
+            (code, &report["outcome"]),
+            (0, &Value::from("placed")),
+            "{report:#}"
+        );
         assert_eq!(report["contact"]["made"], true);
         lateral.push(number(&report, "/truth/lateral_error_mm"));
         open_loop.push(number(&report, "/truth/open_loop_lateral_error_mm"));
@@ -26,14 +33,20 @@ fn the_testbed_is_placed_within_its_budget_over_seeds() {
     let (closed, open) = (median(&mut lateral), median(&mut open_loop));
     assert!(closed <= 1.0, "median lateral error {closed} mm");
     assert!(lateral.iter().all(|&e| e <= 2.5), "{lateral:?}");
-    assert!(open >= 12.0 * closed, "open loop {open} mm, closed loop {closed} mm");
+    assert!(
+        open >= 12.0 * closed,
+        "open loop {open} mm, closed loop {closed} mm"
+    );
 }
 
 #[test]
 fn without_model_error_half_a_millimetre_is_kept() {
     let (code, report) = run(&["scenarios/bluestreak_perfect.toml"]);
     assert_eq!(code, 0, "{report:#}");
-    assert!(number(&report, "/truth/lateral_error_mm") <= 0.5, "{report:#}");
+    assert!(
+        number(&report, "/truth/lateral_error_mm") <= 0.5,
+        "{report:#}"
+    );
 }
 
 #[test]
@@ -41,9 +54,15 @@ fn a_hidden_fiducial_is_bridged_by_what_was_seen_before() {
     let (code, report) = run(&["scenarios/bluestreak_occluded.toml"]);
     assert_eq!(code, 0, "{report:#}");
     let found = report["servo"]["fiducial_found"].as_array().unwrap();
-    assert!(found.contains(&Value::from(true)) && found.contains(&Value::from(false)), "{found:?}");
+    assert!(
+        found.contains(&Value::from(true)) && found.contains(&Value::from(false)),
+        "{found:?}"
+    );
     let lateral = number(&report, "/truth/lateral_error_mm");
-    assert!(lateral < number(&report, "/truth/open_loop_lateral_error_mm") / 3.0, "{report:#}");
+    assert!(
+        lateral < number(&report, "/truth/open_loop_lateral_error_mm") / 3.0,
+        "{report:#}"
+    );
 }
 
 #[test]
@@ -51,7 +70,10 @@ fn a_missing_surface_ends_the_run_safely_with_exit_3() {
     let (code, report) = run(&["scenarios/bluestreak_missed.toml"]);
     assert_eq!(code, 3, "{report:#}");
     assert_eq!(report["outcome"], "aborted");
-    assert!(report["reason"].as_str().unwrap().starts_with("no_contact"), "{report:#}");
+    assert!(
+        report["reason"].as_str().unwrap().starts_with("no_contact"),
+        "{report:#}"
+    );
 }
 
 #[test]
@@ -59,7 +81,10 @@ fn a_pixel_in_the_sky_is_refused_with_exit_3_and_a_reason() {
     let (code, report) = run(&["--set", "target.pixel_px=[638.0, 2.0]"]);
     assert_eq!(code, 3, "{report:#}");
     let reason = report["reason"].as_str().unwrap();
-    assert!(reason.contains("638") && report["phases"][0]["name"] == "designate", "{report:#}");
+    assert!(
+        reason.contains("638") && report["phases"][0]["name"] == "designate",
+        "{report:#}"
+    );
 }
 
 #[test]

@@ -121,6 +121,7 @@ async fn nobody_there_and_nobody_answering_are_told_apart() {
         })
         .await
         .unwrap();
+    settle(&server, &client).await;
     let e = client
         .ask::<_, Nothing>("height/mute", &Nothing {}, short)
         .await

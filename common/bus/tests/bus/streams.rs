@@ -1,12 +1,9 @@
 use crate::support::*;
 use rover_bus::{BusError, Role};
 use rover_messages::Fault;
-use std::{
-    sync::{
-        Arc,
-        atomic::{AtomicU64, Ordering},
-    },
-    time::Duration,
+use std::sync::{
+    Arc,
+    atomic::{AtomicU64, Ordering},
 };
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -14,7 +11,7 @@ async fn subscriber_gets_values_and_late_asker_the_latest() {
     let (server, client, _presence) = pair("stream_values").await;
     let stream = server.stream::<Reading>("depth/state").await.unwrap();
     let mut each = client.watch_each::<Reading>("depth/*", 100).await.unwrap();
-    // the answer comes over the same link as the subscription went: both are in place after it
+    settle(&server, &client).await;
     let early = get_all(client.session(), "depth/state", None)
         .await
         .remove(0)
@@ -47,9 +44,7 @@ async fn watcher_keeps_only_the_latest() {
         .watch_each::<Reading>("depth/state", 100)
         .await
         .unwrap();
-    let _ = client
-        .latest::<Reading>("depth/state", Duration::from_millis(1))
-        .await;
+    settle(&server, &client).await;
     for i in 0..10 {
         stream.publish(reading(f64::from(i))).unwrap();
     }
@@ -92,9 +87,7 @@ async fn value_of_another_version_is_an_error_and_the_watcher_goes_on() {
         .await
         .unwrap();
     let newer = server.stream::<ReadingTwo>("depth/state").await.unwrap();
-    let _ = client
-        .latest::<ReadingTwo>("depth/state", Duration::from_millis(1))
-        .await;
+    settle(&server, &client).await;
     newer
         .publish(ReadingTwo {
             height_m: 1.0,

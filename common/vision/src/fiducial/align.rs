@@ -388,7 +388,7 @@ fn solve(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Option<([f64;
         let v = ((picture.origin_px.y + j as f64 * picture.step_px - map.pixel_px.y) / NORMALISE_PX)
             as f32;
         let line = seen.values(j);
-        for i in 0..picture.width {
+        for (i, &grey) in line.iter().enumerate().take(picture.width) {
             let k = j * picture.width + i;
             if !picture.mask[k] {
                 continue;
@@ -397,7 +397,7 @@ fn solve(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Option<([f64;
                 / NORMALISE_PX) as f32;
             let (gu, gv) = (-picture.du[k], -picture.dv[k]);
             let t = picture.values[k];
-            let y = SearchImage::grey(line[i]);
+            let y = SearchImage::grey(grey);
             let a = [gu, gv, gu * u, gu * v, gv * u, gv * v, t, 1.0, y];
             let mut at = 0;
             for (p, &ap) in a.iter().enumerate() {
