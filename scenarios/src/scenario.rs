@@ -158,7 +158,7 @@ pub struct Limits {
 impl Default for Limits {
     fn default() -> Self {
         Self {
-            start_s: 30.0,
+            start_s: 120.0,
             question_s: 60.0,
             action_s: 1800.0,
             stop_s: 10.0,
@@ -366,6 +366,15 @@ impl Scenario {
             !self.name.trim().is_empty(),
             "name",
             "empty, expected a name",
+        )?;
+        check.require(
+            i64::try_from(self.seed).is_ok(),
+            "seed",
+            format!(
+                "{}, expected 0 to {} as TOML numbers go",
+                self.seed,
+                i64::MAX
+            ),
         )?;
         let pair = robot
             .pair(&self.target.pair)

@@ -10,7 +10,9 @@ use rover::{
     report::{Outcome, RunReport},
     scenario::LoadedScenario,
 };
-use rover_bus::{ActionPolicy, GoalContext, Interrupt, NetworkConfig, Peer, Role, Served, Stream};
+use rover_bus::{
+    ActionPolicy, GoalContext, Interrupt, NetworkConfig, Peer, Presence, Role, Served, Stream,
+};
 use rover_compensation::Compensation;
 use rover_geometry::{Direction, Point};
 use rover_messages::{
@@ -59,7 +61,7 @@ impl World {
             .publish(ArmState {
                 sim_time_s: *time_s,
                 step: 0,
-                joints_rad: vec![0.1, -0.9, 1.3, -1.9, -1.57],
+                joints_rad: vec![0.125, -0.969, 1.316, -1.918, -1.5708],
                 rates_rad_s: vec![0.0; 5],
                 contact: false,
                 switch_travel_m: 0.0,
@@ -74,6 +76,7 @@ impl World {
 struct Network {
     world: Arc<World>,
     runner: Peer,
+    _presence: Presence,
     _served: Vec<Served>,
     _peers: Vec<Peer>,
 }
@@ -83,8 +86,8 @@ fn target() -> Target {
         pair: "body".into(),
         pixel_px: [340.0, 236.0],
         right_pixel_px: [270.0, 236.0],
-        position_m: Point::new(0.57, 0.0, 0.39),
-        normal: Direction::new([0.1, 0.0, 1.0].into()).unwrap(),
+        position_m: Point::new(0.503, 0.039, 0.385),
+        normal: Direction::new([-0.259, 0.141, 0.956].into()).unwrap(),
         covariance_m2: [[1e-8, 0.0, 0.0], [0.0, 1e-8, 0.0], [0.0, 0.0, 4e-8]],
         plane_rms_mm: 0.2,
         roughness_mm: 1.0,
@@ -131,6 +134,7 @@ async fn network(name: &str, script: Script) -> Network {
         asked: Mutex::default(),
     });
     world.pass(0.0);
+    let presence = hardware.announce().await.unwrap();
     let mut served = Vec::new();
     let w = world.clone();
     let stop = hardware.serve(keys::ARM_STOP, move |_: Nothing| {
@@ -263,6 +267,7 @@ async fn network(name: &str, script: Script) -> Network {
     Network {
         world,
         runner,
+        _presence: presence,
         _served: served,
         _peers: vec![hardware, others],
     }

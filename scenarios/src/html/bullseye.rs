@@ -1,7 +1,7 @@
 //! Where the instrument touched, seen along the surface normal.
 
 use rover_messages::simulation::Score;
-use std::fmt::Write;
+use std::{f64::consts::FRAC_1_SQRT_2, fmt::Write};
 
 const SIZE: f64 = 320.0;
 const MIDDLE: f64 = SIZE / 2.0;
