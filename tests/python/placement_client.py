@@ -73,9 +73,9 @@ def command(session, key, commander, goal, on_feedback, limit_s=30.0):
     """Sends a goal and its heartbeats until it has ended; gives the result."""
     goal_id = f"{commander}-{uuid.uuid4().hex[:8]}"
     request = {"goal_id": goal_id, "commander": commander, "goal": goal}
-    ask(session, key, request, limit_s)
     seq = 0
     try:
+        ask(session, key, request, limit_s)
         while True:
             seq += 1  # the same number twice would be one heartbeat
             progress = ask(session, f"{key}/beat", {"goal_id": goal_id, "seq": seq}, limit_s)

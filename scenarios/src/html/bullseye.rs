@@ -37,8 +37,8 @@ pub(super) fn bullseye(score: &Score, predicted_mm: Option<f64>) -> Option<Strin
             out,
             "<circle cx=\"{MIDDLE}\" cy=\"{MIDDLE}\" r=\"{r:.1}\" fill=\"none\" class=\"grid zero\"/>\
              <text x=\"{:.1}\" y=\"{:.1}\">{}</text>",
-            MIDDLE + std::f64::consts::FRAC_1_SQRT_2 * r + 3.0,
-            MIDDLE + std::f64::consts::FRAC_1_SQRT_2 * r + 10.0,
+            MIDDLE + FRAC_1_SQRT_2 * r + 3.0,
+            MIDDLE + FRAC_1_SQRT_2 * r + 10.0,
             mm(f64::from(i) * ring),
         );
     }

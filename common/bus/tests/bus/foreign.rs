@@ -21,6 +21,7 @@ async fn foreign_client_reads_asks_commands_and_cancels() {
         .serve_action("count/up", LOCKSTEP, count)
         .await
         .unwrap();
+    settle(&server, &client).await;
 
     // a stream: JSON unless bincode is asked for
     let json_text = Ok((

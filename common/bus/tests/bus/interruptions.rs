@@ -93,6 +93,7 @@ async fn cancel_reaches_a_handler_between_its_heartbeats() {
 async fn cancel_that_overtakes_its_goal_is_remembered() {
     let (server, client, _presence) = pair("cancel_early").await;
     let (_served, _log) = serve_counting(&server, LOCKSTEP).await;
+    settle(&server, &client).await;
     let raw = foreigner(&client).await;
     let id = serde_json::json!({ "goal_id": "early" });
     let answer = get_json(&raw, "cancel_early/count/up/cancel", id.clone())

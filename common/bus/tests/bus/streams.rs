@@ -115,6 +115,7 @@ async fn value_of_another_version_is_an_error_and_the_watcher_goes_on() {
 async fn picture_is_made_only_when_somebody_wants_it() {
     let (server, client, _presence) = pair("pictures").await;
     let pictures = server.picture_stream("imaging/mast/left").await.unwrap();
+    settle(&server, &client).await;
     let made = Arc::new(AtomicU64::new(0));
     let publish = |byte: u8| {
         let made = made.clone();
