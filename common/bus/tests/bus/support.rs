@@ -3,7 +3,10 @@
 use rover_bus::{ActionPolicy, GoalContext, Interrupt, NetworkConfig, Peer, Role, Served};
 use rover_messages::{Fault, Nothing, Wire, codec};
 use serde::{Deserialize, Serialize};
-use std::time::Duration;
+use std::{
+    sync::atomic::{AtomicU64, Ordering},
+    time::Duration,
+};
 use zenoh::{Session, bytes::Encoding, query::Reply};
 
 /// Longer than anything takes; reached only when something is wrong.
@@ -86,11 +89,13 @@ pub async fn serve_height(server: &Peer, key: &str) -> Served {
 /// After this the server knows all that `client` has declared so far: declarations and questions
 /// travel in order on one link.
 pub async fn settle(server: &Peer, client: &Peer) {
+    static COUNT: AtomicU64 = AtomicU64::new(0);
+    let key = format!("settle/{}", COUNT.fetch_add(1, Ordering::Relaxed));
     let _served = server
-        .serve("settle", |_: Nothing| async { Ok(Nothing {}) })
+        .serve(&key, |_: Nothing| async { Ok(Nothing {}) })
         .await
         .unwrap();
-    let _: Nothing = client.ask("settle", &Nothing {}, LONG).await.unwrap();
+    let _: Nothing = client.ask(&key, &Nothing {}, LONG).await.unwrap();
 }
 
 pub const LOCKSTEP: ActionPolicy = ActionPolicy::lockstep(LONG);
