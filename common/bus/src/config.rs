@@ -11,9 +11,12 @@ use zenoh::key_expr::keyexpr;
 
 /// Time after which a silent link counts as lost. A process that ends is noticed at once; this
 /// is for one that hangs.
-pub const LEASE: Duration = Duration::from_secs(3);
+pub const LEASE: Duration = Duration::from_secs(10);
 /// Limit for reaching an endpoint when a session is opened.
 pub const CONNECT_LIMIT: Duration = Duration::from_secs(5);
+/// How many batches of 64 kB a stream may be ahead of its link before samples are dropped: enough
+/// for a picture and for a short stall of a busy machine.
+const STREAM_QUEUE: usize = 16;
 /// Largest message the transport puts together, in bytes. It is twice the largest payload
 /// ([`rover_messages::codec::MAX_PAYLOAD_BYTES`]), so that a payload over that limit still
 /// arrives and gets an answer that says so; anything larger is dropped by the transport.
@@ -124,6 +127,14 @@ impl NetworkConfig {
                 "{ read: true, write: false }".to_owned(),
             ),
             ("transport/link/tx/lease", LEASE.as_millis().to_string()),
+            (
+                "transport/link/tx/queue/size/data",
+                STREAM_QUEUE.to_string(),
+            ),
+            (
+                "transport/link/tx/queue/size/data_low",
+                STREAM_QUEUE.to_string(),
+            ),
             (
                 "transport/link/rx/max_message_size",
                 MAX_MESSAGE_BYTES.to_string(),

@@ -115,7 +115,7 @@ async fn free_goal_runs_without_heartbeats_and_reports_all_the_same() {
     let result = goal.finish(|f| last.push(f.n)).await.unwrap();
     assert_eq!((result.n, last), (2, vec![2]));
     for state in ["running", "running", "succeeded"] {
-        let sample = feedback.next().await.unwrap();
+        let sample = soon(feedback.next()).await.unwrap();
         let schema = "progress/1(counted/1,counted/1)";
         assert_eq!(sample.encoding, format!("application/bincode;{schema}"));
         let progress: Progress<Counted, Counted> =

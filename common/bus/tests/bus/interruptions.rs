@@ -198,7 +198,7 @@ async fn lost_server_is_noticed_at_once() {
         .unwrap();
     goal.set_beat_limit(LONG * 10);
     let beating = tokio::spawn(async move { (goal.beat().await, goal) });
-    told.recv().await.unwrap();
+    soon(told.recv()).await.unwrap();
     server.close().await;
     let (answer, mut goal) = beating.await.unwrap();
     let e = answer.unwrap_err();

@@ -59,9 +59,9 @@ async fn service_can_neither_read_nor_ask_nor_feed_the_simulators_own_keys() {
     settle(&simulator, &runner).await;
     truth.publish(reading(3.0)).unwrap();
     open.publish(reading(4.0)).unwrap();
-    assert_eq!(everything.next().await.unwrap().key, "arm/state");
+    assert_eq!(soon(everything.next()).await.unwrap().key, "arm/state");
     assert_eq!(
-        everything_for_runner.next().await.unwrap().key,
+        soon(everything_for_runner.next()).await.unwrap().key,
         "sim/truth/pose"
     );
     // nor can it pretend to be the simulator
@@ -74,7 +74,7 @@ async fn service_can_neither_read_nor_ask_nor_feed_the_simulators_own_keys() {
     let last = rover_messages::codec::encode(&reading(7.0), Format::Bincode).unwrap();
     let mut keys = Vec::new();
     loop {
-        let sample = everything_for_runner.next().await.unwrap();
+        let sample = soon(everything_for_runner.next()).await.unwrap();
         keys.push(sample.key);
         if sample.payload == last {
             break;

@@ -36,9 +36,9 @@ async fn second_instance_of_a_name_is_refused() {
         "`arm` is already present in namespace `twice`, expected one instance"
     );
     let mut watcher = b.watch_presence().await.unwrap();
-    while watcher.next().await.unwrap() != ("arm".into(), true) {}
+    while soon(watcher.next()).await.unwrap() != ("arm".into(), true) {}
     drop(first);
-    while watcher.next().await.unwrap() != ("arm".into(), false) {}
+    while soon(watcher.next()).await.unwrap() != ("arm".into(), false) {}
     let _second = b.announce().await.unwrap();
     assert!(a.announce().await.is_err());
 }
@@ -62,16 +62,16 @@ async fn coming_and_going_is_watched() {
     let _a = a.announce().await.unwrap();
     let b = peer("watched", "b", Role::Service, &[&a]).await;
     let mut watcher = b.watch_presence().await.unwrap();
-    assert_eq!(watcher.next().await.unwrap(), ("a".into(), true));
+    assert_eq!(soon(watcher.next()).await.unwrap(), ("a".into(), true));
     let c = peer("watched", "c", Role::Client, &[&a]).await;
     let _c = c.announce().await.unwrap();
     drop(c);
     let d = peer("watched", "d", Role::Service, &[&a, &b]).await;
     let announced = d.announce().await.unwrap();
-    while watcher.next().await.unwrap() != ("d".into(), true) {}
+    while soon(watcher.next()).await.unwrap() != ("d".into(), true) {}
     d.close().await;
     drop(announced);
-    while watcher.next().await.unwrap() != ("d".into(), false) {}
+    while soon(watcher.next()).await.unwrap() != ("d".into(), false) {}
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -167,7 +167,7 @@ async fn server_that_leaves_with_the_question_is_noticed_at_once() {
             started.elapsed(),
         )
     });
-    told.recv().await.unwrap();
+    soon(told.recv()).await.unwrap();
     server.close().await;
     let (answer, took) = asking.await.unwrap();
     let e = answer.unwrap_err();

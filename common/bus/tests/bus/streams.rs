@@ -21,7 +21,7 @@ async fn subscriber_gets_values_and_late_asker_the_latest() {
         stream.publish(reading(f64::from(i))).unwrap();
     }
     for i in 0..10 {
-        let (key, value) = each.next_with_key().await.unwrap();
+        let (key, value) = soon(each.next_with_key()).await.unwrap();
         assert_eq!(
             (key.as_str(), value),
             ("depth/state", reading(f64::from(i)))
@@ -48,11 +48,11 @@ async fn watcher_keeps_only_the_latest() {
     for i in 0..10 {
         stream.publish(reading(f64::from(i))).unwrap();
     }
-    while each.next().await.unwrap() != reading(9.0) {}
+    while soon(each.next()).await.unwrap() != reading(9.0) {}
     // whatever was delivered before has been replaced by the last
-    let mut value = latest.next().await.unwrap();
+    let mut value = soon(latest.next()).await.unwrap();
     if value != reading(9.0) {
-        value = latest.next().await.unwrap();
+        value = soon(latest.next()).await.unwrap();
     }
     assert_eq!(value, reading(9.0));
 }
@@ -94,7 +94,7 @@ async fn value_of_another_version_is_an_error_and_the_watcher_goes_on() {
             label: String::new(),
         })
         .unwrap();
-    let e = watcher.next().await.unwrap_err().to_string();
+    let e = soon(watcher.next()).await.unwrap_err().to_string();
     assert!(
         e.contains("`application/bincode;reading/2`, expected `application/bincode;reading/1`")
     );
@@ -103,7 +103,7 @@ async fn value_of_another_version_is_an_error_and_the_watcher_goes_on() {
         .put("depth/state", r#"{"height_m":2.5,"label":"test"}"#)
         .await
         .unwrap();
-    assert_eq!(watcher.next().await.unwrap(), reading(2.5));
+    assert_eq!(soon(watcher.next()).await.unwrap(), reading(2.5));
     let e = client
         .latest::<Reading>("depth/state", LONG)
         .await
@@ -135,7 +135,7 @@ async fn picture_is_made_only_when_somebody_wants_it() {
     let mut raw = client.watch_raw("imaging/**", 10).await.unwrap();
     settle(&server, &client).await;
     publish(3).unwrap();
-    let sample = raw.next().await.unwrap();
+    let sample = soon(raw.next()).await.unwrap();
     assert_eq!(
         (sample.key.as_str(), sample.encoding.as_str()),
         ("imaging/mast/left", "image/png")

@@ -12,6 +12,12 @@ use zenoh::{Session, bytes::Encoding, query::Reply};
 /// Longer than anything takes; reached only when something is wrong.
 pub const LONG: Duration = Duration::from_secs(20);
 
+/// What comes, or a failure instead of a test that never ends.
+pub async fn soon<T>(event: impl Future<Output = T>) -> T {
+    let waited = tokio::time::timeout(LONG, event).await;
+    waited.unwrap_or_else(|_| panic!("nothing came within {LONG:?}"))
+}
+
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Reading {
