@@ -235,6 +235,7 @@ impl ArmPhysics {
 
     /// One physics step.
     pub fn step(&mut self) {
+        self.plunger.set_spring(&mut self.world.multibody_joints);
         self.world.step();
     }
 

@@ -14,6 +14,10 @@ use rapier3d::prelude as rp;
 /// Index of rapier's generalised coordinate along z.
 const ALONG_Z: usize = 2;
 
+/// Stiffness of the inner stop, N/m. A rigid limit in series with a stiff contact would leave the
+/// arm ringing when it is pressed on.
+const INNER_STOP_N_M: f64 = 1e5;
+
 /// The plunger in rapier's world.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Plunger {
@@ -22,6 +26,7 @@ pub(crate) struct Plunger {
     collider: rp::ColliderHandle,
     spring_n_m: f64,
     rest_m: f64,
+    inner_stop_m: f64,
     ball_radius_m: f64,
 }
 
@@ -33,6 +38,7 @@ impl Default for Plunger {
             collider: rp::ColliderHandle::invalid(),
             spring_n_m: 0.0,
             rest_m: 0.0,
+            inner_stop_m: 0.0,
             ball_radius_m: 0.0,
         }
     }
@@ -66,7 +72,7 @@ pub(crate) fn insert(
     let joint = rp::GenericJointBuilder::new(rp::JointAxesMask::LOCKED_PRISMATIC_AXES)
         .locked_axes(rp::JointAxesMask::all() & !rp::JointAxesMask::LIN_Z)
         .local_frame1(pose(&link_from_ball))
-        .limits(rp::JointAxis::LinZ, [-switch.travel_m, 0.0])
+        .limits(rp::JointAxis::LinZ, [-2.0 * switch.travel_m, 0.0])
         .contacts_enabled(false);
     let joint = world
         .multibody_joints
@@ -78,16 +84,24 @@ pub(crate) fn insert(
         collider,
         spring_n_m: switch.spring_n_m,
         rest_m: switch.preload_n / switch.spring_n_m,
+        inner_stop_m: switch.travel_m,
         ball_radius_m: radius,
     }
 }
 
 impl Plunger {
+    /// Sets the spring for the next step: the switch's own, and past the inner stop that of the
+    /// stop beside it, as one linear spring with the sum of both forces.
     pub fn set_spring(&self, joints: &mut rp::MultibodyJointSet) {
+        let pressed = self.travel_m(joints) > self.inner_stop_m;
+        let stop_n_m = if pressed { INNER_STOP_N_M } else { 0.0 };
+        let stiffness_n_m = self.spring_n_m + stop_n_m;
+        let rest_m =
+            (self.spring_n_m * self.rest_m - stop_n_m * self.inner_stop_m) / stiffness_n_m;
         if let Some((multibody, id)) = joints.get_mut(self.joint)
             && let Some(link) = multibody.link_mut(id)
         {
-            link.joint.set_spring(ALONG_Z, self.spring_n_m, self.rest_m);
+            link.joint.set_spring(ALONG_Z, stiffness_n_m, rest_m);
         }
     }
 

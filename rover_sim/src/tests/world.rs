@@ -282,6 +282,24 @@ fn what_cannot_be_executed_is_refused_by_name() {
 }
 
 #[test]
+fn a_dead_switch_leaves_the_stop_to_the_force_guard() {
+    let mut description = scene();
+    description.faults.switch_dead = true;
+    let mut world = world(&description, 1);
+    let guard = Guard {
+        max_force_n: Some(8.0),
+        max_deviation_rad: None,
+    };
+    let result = approach(&mut world, 0.005, guard).unwrap();
+    assert!(!result.completed && !result.state.contact);
+    assert!(result.joints_at_contact_rad.is_none());
+    let Some(StopReason::Force { found_n, limit_n }) = result.state.stop_reason else {
+        panic!("{:?}", result.state.stop_reason);
+    };
+    assert!(found_n > limit_n && found_n < 14.0, "{found_n} N");
+}
+
+#[test]
 fn a_rock_that_vanishes_is_neither_felt_nor_seen() {
     let mut description = scene();
     let still = world(&description, 1);
