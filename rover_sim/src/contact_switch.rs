@@ -96,8 +96,7 @@ impl Plunger {
         let pressed = self.travel_m(joints) > self.inner_stop_m;
         let stop_n_m = if pressed { INNER_STOP_N_M } else { 0.0 };
         let stiffness_n_m = self.spring_n_m + stop_n_m;
-        let rest_m =
-            (self.spring_n_m * self.rest_m - stop_n_m * self.inner_stop_m) / stiffness_n_m;
+        let rest_m = (self.spring_n_m * self.rest_m - stop_n_m * self.inner_stop_m) / stiffness_n_m;
         if let Some((multibody, id)) = joints.get_mut(self.joint)
             && let Some(link) = multibody.link_mut(id)
         {

@@ -106,7 +106,7 @@ pub struct Mission<'a> {
 struct Record {
     target: Option<Target>,
     placed: Option<PlaceResult>,
-    contact: Option<ContactResult>,
+    contact: Option<ContactReport>,
     score: Option<Score>,
 }
 
@@ -250,20 +250,15 @@ impl<'a> Mission<'a> {
             },
         )
         .await;
+        if let Err(fault) = &contact {
+            record.contact = ContactReport::missed(fault);
+        }
         let contact: ContactResult = self.end(started, contact).await?;
         if let Some(evidence) = &mut self.evidence {
             evidence.after_contact(peer, question_limit).await;
         }
-        let made = contact.made;
-        record.contact = Some(contact);
-        if made {
-            return Ok(());
-        }
-        Err(Fault::new(
-            RUNNER,
-            "no_contact",
-            "the contact motion ended without contact",
-        ))
+        record.contact = Some(ContactReport::from(&contact));
+        Ok(())
     }
 
     /// Measures the placement against the truth; the simulator's privilege.
@@ -392,7 +387,7 @@ impl<'a> Mission<'a> {
                 .placed
                 .as_ref()
                 .map(|placed| ServoReport::new(method, placed)),
-            contact: record.contact.as_ref().map(ContactReport::from),
+            contact: record.contact.clone(),
             truth: record.score.as_ref().map(TruthReport::from),
             digest: String::new(),
         }

@@ -3,6 +3,7 @@
 //! The field names are part of the product's interface. What a run did not come to is `null`.
 
 use rover_messages::{
+    Fault,
     codec::{NotFinite, check_finite},
     placement::{ContactResult, Method, PlaceResult},
     simulation::Score,
@@ -121,7 +122,7 @@ pub struct ContactReport {
     pub switch_travel_mm: f64,
     /// Largest axial force, N.
     pub peak_force_n: f64,
-    /// Distance driven along the normal until contact, m.
+    /// Distance driven along the normal until contact, or until the motion ended without it, m.
     pub approach_m: f64,
 }
 
@@ -171,10 +172,23 @@ impl ServoReport {
     }
 }
 
+impl ContactReport {
+    /// A motion that ended without contact, from the numbers that its fault carries.
+    pub fn missed(fault: &Fault) -> Option<Self> {
+        let detail = |name: &str| fault.details.get(name).copied();
+        Some(Self {
+            made: false,
+            switch_travel_mm: detail("switch_travel_mm")?,
+            peak_force_n: detail("peak_force_n")?,
+            approach_m: detail("approach_mm")? / 1e3,
+        })
+    }
+}
+
 impl From<&ContactResult> for ContactReport {
     fn from(c: &ContactResult) -> Self {
         Self {
-            made: c.made,
+            made: true,
             switch_travel_mm: c.switch_travel_m * 1e3,
             peak_force_n: c.peak_force_n,
             approach_m: c.approach_m,

@@ -149,8 +149,6 @@ pub struct ContactFeedback {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ContactResult {
-    /// Whether the switch closed.
-    pub made: bool,
     /// Switch travel at rest in contact, m.
     pub switch_travel_m: f64,
     /// Largest axial force, N.

@@ -96,6 +96,12 @@ impl Contact {
         let contact_q = match motion.outcome(&done) {
             Outcome::Contact => done.joints_at_contact_rad.clone().unwrap_or_default(),
             Outcome::NoContact(fault) => {
+                let mut fault = fault
+                    .with("peak_force_n", done.peak_force_n)
+                    .with("switch_travel_mm", done.state.switch_travel_m * 1e3);
+                if let Ok(end_m) = motion.distance_m(&done.state.joints_rad) {
+                    fault = fault.with("approach_mm", (start_m - end_m) * 1e3);
+                }
                 let back = self.retract(context, &motion, &done).await;
                 let action = if back.is_ok() {
                     "arm retracted to the standoff"
@@ -112,7 +118,6 @@ impl Contact {
                 .map_err(|f| (f, STOPPED))?;
         }
         Ok(ContactResult {
-            made: true,
             switch_travel_m: done.state.switch_travel_m,
             peak_force_n: done.peak_force_n,
             approach_m: start_m - end_m,
