@@ -4,6 +4,7 @@ pub mod doctor;
 pub mod inspect;
 pub mod run;
 pub mod service;
+pub mod study;
 pub mod up;
 
 use crate::{

@@ -3,7 +3,7 @@
 
 mod bullseye;
 mod picture;
-mod plot;
+pub(crate) mod plot;
 mod timeline;
 
 use crate::{
@@ -12,16 +12,16 @@ use crate::{
     scenario::LoadedScenario,
 };
 use picture::{Mark, Overlay, figure};
-use plot::{Plot, Series};
+use plot::{Marks, Plot, Series};
 use rover_messages::placement::Look;
 use std::fmt::Write;
 
 const STYLE: &str = include_str!("html/page.css");
 /// Colours that remain distinct for colour-blind readers.
-const BLUE: &str = "#0072b2";
-const ORANGE: &str = "#d55e00";
-const GREEN: &str = "#009e73";
-const PURPLE: &str = "#aa4499";
+pub(crate) const BLUE: &str = "#0072b2";
+pub(crate) const ORANGE: &str = "#d55e00";
+pub(crate) const GREEN: &str = "#009e73";
+pub(crate) const PURPLE: &str = "#aa4499";
 const YELLOW: &str = "#ffd21f";
 
 /// Why a page could not be made.
@@ -60,18 +60,26 @@ pub fn page(
             "<details><summary>TOML, every default filled in</summary><pre>{toml}</pre></details>"
         ),
     );
-    let title = escape(&format!("{}: {}", scenario.name, outcome(report)));
-    Ok(format!(
-        "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
-         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
-         <title>{title}</title><style>{STYLE}</style></head>\n<body><main>\n{body}\
-         <footer>rover {} · robot <b>{}</b> · seed <b>{}</b> · digest <code>{}</code></footer>\
-         \n</main></body></html>\n",
+    let title = format!("{}: {}", scenario.name, outcome(report));
+    let footer = format!(
+        "rover {} · robot <b>{}</b> · seed <b>{}</b> · digest <code>{}</code>",
         env!("CARGO_PKG_VERSION"),
         escape(&report.robot),
         report.seed,
         report.digest,
-    ))
+    );
+    Ok(document(&title, &body, &footer))
+}
+
+/// A self-contained page; `title` is text, `body` and `footer` are HTML.
+pub(crate) fn document(title: &str, body: &str, footer: &str) -> String {
+    format!(
+        "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
+         <title>{}</title><style>{STYLE}</style></head>\n<body><main>\n{body}\
+         <footer>{footer}</footer>\n</main></body></html>\n",
+        escape(title)
+    )
 }
 
 fn outcome(report: &RunReport) -> &'static str {
@@ -94,7 +102,7 @@ fn header(report: &RunReport, description: &str) -> String {
     )
 }
 
-fn section(title: &str, content: &str) -> String {
+pub(crate) fn section(title: &str, content: &str) -> String {
     format!("<section><h2>{title}</h2>\n{content}\n</section>\n")
 }
 
@@ -262,16 +270,19 @@ fn servo(report: &RunReport, evidence: &Evidence) -> String {
                 name: "x",
                 colour: BLUE,
                 points: component(0),
+                marks: Marks::Joined,
             },
             Series {
                 name: "y",
                 colour: ORANGE,
                 points: component(1),
+                marks: Marks::Joined,
             },
             Series {
                 name: "z",
                 colour: GREEN,
                 points: component(2),
+                marks: Marks::Joined,
             },
         ],
     }
@@ -293,6 +304,7 @@ fn servo(report: &RunReport, evidence: &Evidence) -> String {
             name: "predicted",
             colour: PURPLE,
             points: over_looks(&|l| l.predicted_error_m * 1e3),
+            marks: Marks::Joined,
         }],
     }
     .svg();
@@ -439,7 +451,7 @@ fn truth(report: &RunReport, evidence: &Evidence) -> String {
 }
 
 /// Text as HTML.
-fn escape(text: &str) -> String {
+pub(crate) fn escape(text: &str) -> String {
     text.replace('&', "&amp;")
         .replace('<', "&lt;")
         .replace('>', "&gt;")

@@ -1,7 +1,7 @@
 //! The `rover` command.
 
 use clap::{Parser, Subcommand};
-use rover::commands::{CommandError, Exit, doctor, inspect, run, service, up};
+use rover::commands::{CommandError, Exit, doctor, inspect, run, service, study, up};
 use std::{io::IsTerminal, process::ExitCode};
 use tracing_subscriber::EnvFilter;
 
@@ -23,6 +23,7 @@ enum Command {
     Service(service::ServiceArgs),
     Inspect(inspect::InspectArgs),
     Doctor(doctor::DoctorArgs),
+    Study(study::StudyArgs),
 }
 
 fn main() -> ExitCode {
@@ -63,5 +64,6 @@ async fn execute(command: Command) -> Result<Exit, CommandError> {
         Command::Service(args) => service::run(args).await,
         Command::Inspect(args) => inspect::run(args).await,
         Command::Doctor(args) => doctor::run(args).await,
+        Command::Study(args) => study::run(&args),
     }
 }

@@ -10,14 +10,26 @@ const TOP: f64 = 48.0;
 const BOTTOM: f64 = 40.0;
 
 /// One line.
-pub(super) struct Series {
+pub(crate) struct Series {
     pub name: &'static str,
     pub colour: &'static str,
     pub points: Vec<(f64, f64)>,
+    pub marks: Marks,
+}
+
+/// How the points of a series are drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Marks {
+    /// Dots joined by a line.
+    Joined,
+    /// Dots alone.
+    Dots,
+    /// The line alone.
+    Line,
 }
 
 /// Some lines over common axes.
-pub(super) struct Plot {
+pub(crate) struct Plot {
     pub title: &'static str,
     pub x_label: &'static str,
     pub y_label: &'static str,
@@ -136,18 +148,21 @@ impl Plot {
                 .iter()
                 .map(|p| format!("{:.1},{:.1}", x.at(p.0), y.at(p.1)))
                 .collect();
+            let line = s.marks != Marks::Dots;
             let _ = write!(
                 out,
                 "<polyline points=\"{}\" fill=\"none\" stroke=\"{}\" stroke-width=\"2\"/>",
-                points.join(" "),
+                if line { points.join(" ") } else { String::new() },
                 s.colour
             );
-            for p in &s.points {
+            let dots = s.marks != Marks::Line;
+            for p in s.points.iter().filter(|_| dots) {
                 let _ = write!(
                     out,
-                    "<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"3.2\" fill=\"{}\"/>",
+                    "<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"{}\" fill=\"{}\"/>",
                     x.at(p.0),
                     y.at(p.1),
+                    if line { 3.2 } else { 2.2 },
                     s.colour
                 );
             }
@@ -220,6 +235,7 @@ mod tests {
                 name: "a",
                 colour: "#000",
                 points,
+                marks: Marks::Joined,
             }],
         };
         assert!(plot(vec![]).svg().contains("nothing seen"));
