@@ -10,6 +10,7 @@
 //! | [`report`] | what did the run come to |
 //! | [`html`] | how does a person see it |
 //! | [`study`] | what does the method achieve, and the others |
+//! | [`tables`] | how do numbers come in from files and go out again |
 //! | [`registry`] | what is this payload on the network |
 
 pub mod commands;
@@ -24,3 +25,4 @@ pub mod registry;
 pub mod report;
 pub mod scenario;
 pub mod study;
+pub mod tables;
