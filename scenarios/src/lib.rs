@@ -8,11 +8,13 @@
 //! | [`launch`] | how do simulator and services come up, and down again |
 //! | [`placement`] | what happens in which order |
 //! | [`report`] | what did the run come to |
+//! | [`campaign`] | what do many runs come to |
 //! | [`html`] | how does a person see it |
 //! | [`study`] | what does the method achieve, and the others |
 //! | [`tables`] | how do numbers come in from files and go out again |
 //! | [`registry`] | what is this payload on the network |
 
+pub mod campaign;
 pub mod commands;
 pub mod embedded;
 pub mod evidence;

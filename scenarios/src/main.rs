@@ -1,7 +1,7 @@
 //! The `rover` command.
 
 use clap::{Parser, Subcommand};
-use rover::commands::{CommandError, Exit, doctor, inspect, run, service, study, up};
+use rover::commands::{CommandError, Exit, campaign, doctor, inspect, run, service, study, up};
 use std::{io::IsTerminal, process::ExitCode};
 use tracing_subscriber::EnvFilter;
 
@@ -20,6 +20,7 @@ struct Cli {
 enum Command {
     Run(run::RunArgs),
     Up(up::UpArgs),
+    Campaign(campaign::CampaignArgs),
     Service(service::ServiceArgs),
     Inspect(inspect::InspectArgs),
     Doctor(doctor::DoctorArgs),
@@ -61,6 +62,7 @@ async fn execute(command: Command) -> Result<Exit, CommandError> {
     match command {
         Command::Run(args) => run::run(args).await,
         Command::Up(args) => up::run(args).await,
+        Command::Campaign(args) => campaign::run(args).await,
         Command::Service(args) => service::run(args).await,
         Command::Inspect(args) => inspect::run(args).await,
         Command::Doctor(args) => doctor::run(args).await,

@@ -6,6 +6,7 @@
 
 mod documentation;
 mod overrides;
+mod variation;
 
 use crate::embedded;
 use rover_messages::{
@@ -20,6 +21,7 @@ use std::{
     sync::Arc,
     time::Duration,
 };
+pub use variation::{CampaignSettings, Variation};
 
 /// One scenario.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -49,6 +51,9 @@ pub struct Scenario {
     /// Limits on wall-clock time: a run that exceeds one is ended as a fault.
     #[serde(default)]
     pub limits: Limits,
+    /// What differs from run to run of a campaign.
+    #[serde(default)]
+    pub campaign: CampaignSettings,
     /// The world and the truth about the robot.
     #[serde(default)]
     pub simulation: SimulationDescription,
@@ -243,13 +248,36 @@ impl LoadedScenario {
     /// # Errors
     /// [`ScenarioError`] with file, line or field, what was found and what was expected.
     pub fn load(name: &str, sets: &[String], seed: Option<u64>) -> Result<Self, ScenarioError> {
+        let (scenario, origin) = Self::read(name, sets, seed)?;
+        Self::complete(scenario, &origin)
+    }
+
+    /// As [`LoadedScenario::load`], with the fields that the scenario's campaign varies drawn
+    /// from the seed.
+    ///
+    /// # Errors
+    /// As [`LoadedScenario::load`].
+    pub fn load_varied(
+        name: &str,
+        sets: &[String],
+        seed: Option<u64>,
+    ) -> Result<Self, ScenarioError> {
+        let (scenario, origin) = Self::read(name, sets, seed)?;
+        Self::complete(variation::drawn(scenario, &origin)?, &origin)
+    }
+
+    fn read(
+        name: &str,
+        sets: &[String],
+        seed: Option<u64>,
+    ) -> Result<(Scenario, String), ScenarioError> {
         let (text, origin) = read(embedded::SCENARIOS, "scenario", Path::new(name), name)?;
         let mut scenario = Scenario::parse(&text, &origin)?;
         for set in sets {
             scenario = overrides::apply(&scenario, set)?;
         }
         scenario.seed = seed.unwrap_or(scenario.seed);
-        Self::complete(scenario, &origin)
+        Ok((scenario, origin))
     }
 
     /// Reads the robot of a scenario and checks both; `origin` is the scenario's path.

@@ -25,6 +25,10 @@ pub struct RunArgs {
     /// Replaces one field by a TOML value, e.g. servo.method=epec; may be repeated
     #[arg(long, value_name = "PATH=VALUE")]
     pub set: Vec<String>,
+    /// Draws the fields that the scenario's campaign varies from the seed, as `rover campaign`
+    /// does
+    #[arg(long)]
+    pub varied: bool,
     /// Writes the report as JSON; `-` is standard output
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,
@@ -53,7 +57,12 @@ const PAGE: &str = "index.html";
 /// # Errors
 /// [`CommandError`].
 pub async fn run(args: RunArgs) -> Result<Exit, CommandError> {
-    let loaded = LoadedScenario::load(&args.scenario, &args.set, args.seed)?;
+    let load = if args.varied {
+        LoadedScenario::load_varied
+    } else {
+        LoadedScenario::load
+    };
+    let loaded = load(&args.scenario, &args.set, args.seed)?;
     if args.print {
         print(&loaded.scenario.to_toml()?)?;
         return Ok(Exit::Done);

@@ -74,6 +74,11 @@ const FIELDS: &[(&str, &str)] = &[
         "For one action (servo, contact, arm motion), s.",
     ),
     ("limits.stop_s", "For an orderly stop, s."),
+    ("campaign", "What differs from run to run of a campaign."),
+    (
+        "campaign.vary",
+        "Fields that are drawn from the seed: { path, uniform = [low, high] | choice = [..] | cycle = [..] }.",
+    ),
 ];
 
 /// The text with a comment before each field that has one.

@@ -22,6 +22,31 @@ pub(super) fn apply(scenario: &Scenario, set: &str) -> Result<Scenario, Scenario
         .filter(|(path, value)| !path.is_empty() && !value.is_empty())
         .ok_or_else(|| error("expected PATH=VALUE, e.g. servo.tolerance_mm=0.2".into()))?;
     let value = parse_value(value).map_err(error)?;
+    replace_as(scenario, set, path, value)
+}
+
+/// The scenario with the field at `path` replaced.
+///
+/// # Errors
+/// As [`apply`].
+pub(super) fn replace(
+    scenario: &Scenario,
+    path: &str,
+    value: Value,
+) -> Result<Scenario, ScenarioError> {
+    replace_as(scenario, &format!("{path}={value}"), path, value)
+}
+
+fn replace_as(
+    scenario: &Scenario,
+    set: &str,
+    path: &str,
+    value: Value,
+) -> Result<Scenario, ScenarioError> {
+    let error = |message: String| ScenarioError::Override {
+        given: set.into(),
+        message,
+    };
     let root = Table::try_from(scenario).map_err(|e| error(e.to_string()))?;
     let mut changed = Value::Table(root.clone());
     let kind = |message: String| ScenarioError::Override {

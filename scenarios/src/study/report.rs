@@ -188,9 +188,8 @@ fn table1(table: &Table1) -> String {
             .map(|(k, mm)| (k as f64, mm.log10()))
             .collect()
     };
-    let ours = |r: &super::table1::Row| {
-        vec![r.before_mm, r.after_mm, r.after_two_mm, r.after_three_mm]
-    };
+    let ours =
+        |r: &super::table1::Row| vec![r.before_mm, r.after_mm, r.after_two_mm, r.after_three_mm];
     let paper = |r: &super::table1::Row| vec![r.paper_before_mm, r.paper_after_mm];
     let series = |name, colour, points, marks| Series {
         name,
@@ -229,7 +228,10 @@ fn table1(table: &Table1) -> String {
 /// One reference place as a plot: every target, the fitted line, the field, the open loop.
 fn scatter(r: &Reference) -> String {
     let points = |of: fn(&super::locality::LocalityPoint) -> f64| {
-        r.points.iter().map(|p| (p.distance_m * 100.0, of(p))).collect()
+        r.points
+            .iter()
+            .map(|p| (p.distance_m * 100.0, of(p)))
+            .collect()
     };
     let far = r.points.last().map_or(0.0, |p| p.distance_m);
     let line = |x: f64| (x * 100.0, r.intercept_mm + r.slope_mm_per_m * x);
