@@ -1,6 +1,7 @@
 //! The instrument on the last link.
 
-use crate::arm::{Arm, ArmError};
+use crate::arm::Arm;
+use crate::rows::ArmError;
 use nalgebra::{Isometry3, Unit, Vector3};
 use serde::{Deserialize, Serialize};
 
