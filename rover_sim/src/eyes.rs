@@ -6,7 +6,7 @@ use crate::{
     terrain::Terrain,
     truth::Truth,
 };
-use nalgebra::{Isometry3, Rotation3, Unit, UnitQuaternion, Vector2, Vector3};
+use nalgebra::{Isometry3, Point3, Rotation3, Unit, UnitQuaternion, Vector2, Vector3};
 use rover_cameras::Camera;
 use rover_messages::{
     Fault,
@@ -18,7 +18,7 @@ use rover_render::{
     CameraId, DynamicPart, FrameState, Grey8, ImagingParameters, Mesh, Plate, Renderer, Scene, Sky,
     StaticMesh, Sun, Surface, shapes,
 };
-use rover_robot::{Capsule, Robot};
+use rover_robot::{Capsule, FiducialDescription, Robot};
 use std::{
     collections::BTreeMap,
     sync::{
@@ -315,7 +315,7 @@ fn mean_normal(mesh: &Mesh, centre: &Vector3<f64>, radius_m: f64) -> Vector3<f64
 fn robot_parts(robot: &Robot) -> (Vec<DynamicPart>, Plate) {
     let d = robot.description();
     let last = d.arm.joints.len() - 1;
-    let plate_centre = Vector3::from(d.fiducial.centre_m);
+    let plate_from_link = robot.link_from_plate.inverse();
     let mut parts: Vec<DynamicPart> = d
         .arm
         .joints
@@ -323,11 +323,11 @@ fn robot_parts(robot: &Robot) -> (Vec<DynamicPart>, Plate) {
         .enumerate()
         .map(|(i, joint)| {
             let mut mesh = Mesh::default();
-            // A capsule around the plate's centre stands for the plate, which is drawn as such.
+            // Capsules in the plate stand for the plate, which is drawn as such.
             for c in joint
                 .shape
                 .iter()
-                .filter(|c| i != last || !encloses(c, &plate_centre))
+                .filter(|c| i != last || !lies_in_plate(c, &plate_from_link, &d.fiducial))
             {
                 mesh.append(&capsule_mesh(c));
             }
@@ -387,11 +387,17 @@ fn capsule_mesh(c: &Capsule) -> Mesh {
         .transformed(&Isometry3::from_parts(from.into(), turn))
 }
 
-fn encloses(c: &Capsule, p: &Vector3<f64>) -> bool {
-    let (from, to) = (Vector3::from(c.from_m), Vector3::from(c.to_m));
-    let along = to - from;
-    let s = ((p - from).dot(&along) / along.norm_squared().max(1e-18)).clamp(0.0, 1.0);
-    (from + along * s - p).norm() < c.radius_m
+fn lies_in_plate(
+    c: &Capsule,
+    plate_from_link: &Isometry3<f64>,
+    fiducial: &FiducialDescription,
+) -> bool {
+    [c.from_m, c.to_m].iter().all(|end| {
+        let p = plate_from_link * Point3::from(*end);
+        p.x.abs() <= fiducial.layout.half_width_m
+            && p.y.abs() <= fiducial.layout.half_height_m
+            && p.z.abs() < c.radius_m
+    })
 }
 
 fn sun(d: &SunDescription) -> Sun {

@@ -1,6 +1,7 @@
 //! The verbs of the command line, one file each.
 
 pub mod campaign;
+pub mod arm;
 pub mod doctor;
 pub mod inspect;
 pub mod run;

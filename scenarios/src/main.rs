@@ -1,7 +1,7 @@
 //! The `rover` command.
 
 use clap::{Parser, Subcommand};
-use rover::commands::{CommandError, Exit, campaign, doctor, inspect, run, service, study, up};
+use rover::commands::{CommandError, Exit, arm, campaign, doctor, inspect, run, service, study, up};
 use std::{io::IsTerminal, process::ExitCode};
 use tracing_subscriber::EnvFilter;
 
@@ -23,6 +23,7 @@ enum Command {
     Campaign(campaign::CampaignArgs),
     Service(service::ServiceArgs),
     Inspect(inspect::InspectArgs),
+    Arm(arm::ArmArgs),
     Doctor(doctor::DoctorArgs),
     Study(study::StudyArgs),
 }
@@ -65,6 +66,7 @@ async fn execute(command: Command) -> Result<Exit, CommandError> {
         Command::Campaign(args) => campaign::run(args).await,
         Command::Service(args) => service::run(args).await,
         Command::Inspect(args) => inspect::run(args).await,
+        Command::Arm(args) => arm::run(args),
         Command::Doctor(args) => doctor::run(args).await,
         Command::Study(args) => study::run(&args),
     }

@@ -34,6 +34,41 @@ fn arm() -> Arm {
     Arm::new(rows.to_vec(), vec![limit; 5]).expect("the arm is well formed")
 }
 
+/// The same arm for the crate `k`: every row's constant part is a fixed joint behind the turning one.
+fn peer(arm: &Arm, tool: &Tool) -> k::SerialChain<f64> {
+    use k::{Isometry3, JointType, NodeBuilder, Translation3, UnitQuaternion, Vector3};
+    let mut nodes = Vec::new();
+    let mut origin = Isometry3::identity();
+    for (i, row) in arm.rows().iter().enumerate() {
+        let node = NodeBuilder::new()
+            .name(&format!("joint{i}"))
+            .rotation(origin.rotation)
+            .translation(origin.translation)
+            .joint_type(JointType::Rotational {
+                axis: Vector3::z_axis(),
+            })
+            .into_node();
+        nodes.push(node);
+        origin = Isometry3::from_parts(
+            Translation3::new(row.a_m, 0.0, row.d_m),
+            UnitQuaternion::from_axis_angle(&Vector3::x_axis(), row.alpha_rad),
+        );
+    }
+    let tip = tool.tip_in_link;
+    let end = origin * Isometry3::translation(tip.x, tip.y, tip.z);
+    let node = NodeBuilder::new()
+        .name("tip")
+        .rotation(end.rotation)
+        .translation(end.translation)
+        .joint_type(JointType::Fixed)
+        .into_node();
+    nodes.push(node);
+    for pair in nodes.windows(2) {
+        pair[1].set_parent(&pair[0]);
+    }
+    k::SerialChain::new_unchecked(k::Chain::from_root(nodes[0].clone()))
+}
+
 fn benches(c: &mut Criterion) {
     let arm = arm();
     let tool = Tool::on_turret(0.1306, 0.0);
@@ -55,6 +90,39 @@ fn benches(c: &mut Criterion) {
     });
     c.bench_function("ik, closest", |b| {
         b.iter(|| closest_solution(black_box(&arm), &tool, black_box(&goal), &near));
+    });
+    let chain = peer(&arm, &tool);
+    chain.set_joint_positions_unchecked(&q);
+    let wanted = chain.end_transform();
+    c.bench_function("peer k: fk", |b| {
+        b.iter(|| {
+            chain.set_joint_positions_unchecked(black_box(&q));
+            chain.end_transform()
+        });
+    });
+    c.bench_function("peer k: fk + jacobian", |b| {
+        b.iter(|| {
+            chain.set_joint_positions_unchecked(black_box(&q));
+            chain.update_transforms();
+            k::jacobian(&chain)
+        });
+    });
+    // The point and two of the three rotations: what a five-joint arm can be asked for. 1e-9 m.
+    let solver = k::JacobianIkSolver::new(1e-9, 1e-9, 0.8, 100);
+    let constraints = k::Constraints {
+        rotation_z: false,
+        ..Default::default()
+    };
+    c.bench_function("peer k: ik, 0.02 rad away, 1e-9 m", |b| {
+        b.iter(|| {
+            chain.set_joint_positions_unchecked(&near);
+            k::InverseKinematicsSolver::solve_with_constraints(
+                &solver,
+                &chain,
+                black_box(&wanted),
+                &constraints,
+            )
+        });
     });
     let options = NumericOptions::default();
     c.bench_function("ik, numeric, 0.02 rad away", |b| {

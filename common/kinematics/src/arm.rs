@@ -1,9 +1,9 @@
-//! The arm: Denavit-Hartenberg rows, joint limits, forward kinematics.
+//! The arm: forward kinematics of its rows.
 
 use crate::inverse::family::{Family, FamilyMismatch};
+use crate::rows::{ArmError, DhRow, JointLimits, finite};
 use crate::trig::sin_cos;
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
-use serde::{Deserialize, Serialize};
 
 /// Fewest joints of an [`Arm`].
 pub const MIN_JOINTS: usize = 4;
@@ -13,90 +13,6 @@ pub const MAX_JOINTS: usize = 7;
 pub const LIMIT_TOLERANCE_RAD: f64 = 1e-9;
 /// `MAX_JOINTS` rounded up to the lanes of the sine kernel.
 pub(crate) const PADDED: usize = 8;
-
-/// One row of the classic Denavit-Hartenberg table:
-/// `Rz(theta + theta_offset_rad) Tz(d_m) Tx(a_m) Rx(alpha_rad)`.
-#[derive(Serialize, Deserialize, Clone, Debug, PartialEq)]
-#[serde(deny_unknown_fields)]
-pub struct DhRow {
-    /// Length along the new x axis, metres.
-    pub a_m: f64,
-    /// Twist about the new x axis, radians.
-    pub alpha_rad: f64,
-    /// Offset along the old z axis, metres.
-    pub d_m: f64,
-    /// Added to the joint angle, radians.
-    pub theta_offset_rad: f64,
-}
-
-/// What one joint may do.
-#[derive(Serialize, Deserialize, Clone, Debug, PartialEq)]
-#[serde(deny_unknown_fields)]
-pub struct JointLimits {
-    /// Smallest joint angle, radians.
-    pub lower_rad: f64,
-    /// Largest joint angle, radians.
-    pub upper_rad: f64,
-    /// Largest magnitude of the joint rate, rad/s, positive.
-    pub max_rate_rad_s: f64,
-    /// Largest magnitude of the joint acceleration, rad/s^2, positive.
-    pub max_acceleration_rad_s2: f64,
-}
-
-/// Why an arm cannot be built or asked. Joint indices count from 0.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum ArmError {
-    /// Too few or too many rows.
-    #[error("an arm has {MIN_JOINTS} to {MAX_JOINTS} joints, got {found} Denavit-Hartenberg rows")]
-    JointCount {
-        /// Rows given.
-        found: usize,
-    },
-    /// A list has the wrong length for this arm.
-    #[error("{what}: expected {expected} values, got {found}")]
-    WrongLength {
-        /// Which list.
-        what: &'static str,
-        /// Length that fits the arm.
-        expected: usize,
-        /// Length given.
-        found: usize,
-    },
-    /// A number is NaN or infinite.
-    #[error("{what}[{index}] = {value} is not a finite number")]
-    NotFinite {
-        /// Which list or vector.
-        what: &'static str,
-        /// Place in it, from 0.
-        index: usize,
-        /// The offending value.
-        value: f64,
-    },
-    /// A joint's limits contradict themselves.
-    #[error("joint[{joint}]: {what} = {value}, expected {expected}")]
-    BadLimit {
-        /// Joint, from 0.
-        joint: usize,
-        /// Field of [`JointLimits`].
-        what: &'static str,
-        /// Value given.
-        value: f64,
-        /// What would be right.
-        expected: &'static str,
-    },
-    /// A joint angle is outside its limits.
-    #[error("joint[{joint}] = {value_rad:.6} rad is outside {lower_rad:.6} to {upper_rad:.6} rad")]
-    OutsideLimit {
-        /// Joint, from 0.
-        joint: usize,
-        /// Joint angle, radians.
-        value_rad: f64,
-        /// Lower limit, radians.
-        lower_rad: f64,
-        /// Upper limit, radians.
-        upper_rad: f64,
-    },
-}
 
 /// Constants of one row, prepared for the kernels.
 #[derive(Clone, Debug, PartialEq)]
@@ -122,6 +38,8 @@ pub struct Arm {
     limits: Vec<JointLimits>,
     pub(crate) links: [Link; MAX_JOINTS],
     half_twists: [HalfTwist; MAX_JOINTS],
+    /// One per joint, or none at all.
+    tilts_rad: Vec<f64>,
     pub(crate) family: Result<Family, FamilyMismatch>,
 }
 
@@ -148,18 +66,6 @@ impl Frames {
     }
 }
 
-/// Refuses a vector with a component that is not finite.
-pub(crate) fn finite(what: &'static str, values: &[f64]) -> Result<(), ArmError> {
-    match values.iter().position(|v| !v.is_finite()) {
-        None => Ok(()),
-        Some(index) => Err(ArmError::NotFinite {
-            what,
-            index,
-            value: values[index],
-        }),
-    }
-}
-
 impl Arm {
     /// An arm from its rows and the limits of its joints, both from the base outwards.
     ///
@@ -168,6 +74,21 @@ impl Arm {
     /// finite, a lower limit is not below its upper one, or a rate or acceleration is not
     /// positive.
     pub fn new(rows: Vec<DhRow>, limits: Vec<JointLimits>) -> Result<Self, ArmError> {
+        Self::with_tilts(rows, Vec::new(), limits)
+    }
+
+    /// An arm whose rows are followed by a turn of `tilts_rad` about the new y axis:
+    /// `Rz(theta + offset) Tz(d) Tx(a) Rx(alpha) Ry(tilt)`. This fifth number (Hayati and
+    /// Mirmirani 1985) describes joints that are nearly but not quite parallel, whose common normal
+    /// lies far away. No tilts at all, or one per row.
+    ///
+    /// # Errors
+    /// As [`Arm::new`].
+    pub fn with_tilts(
+        rows: Vec<DhRow>,
+        mut tilts_rad: Vec<f64>,
+        limits: Vec<JointLimits>,
+    ) -> Result<Self, ArmError> {
         let n = rows.len();
         if !(MIN_JOINTS..=MAX_JOINTS).contains(&n) {
             return Err(ArmError::JointCount { found: n });
@@ -187,6 +108,18 @@ impl Arm {
         column("alpha_rad", |r| r.alpha_rad)?;
         column("d_m", |r| r.d_m)?;
         column("theta_offset_rad", |r| r.theta_offset_rad)?;
+        if !tilts_rad.is_empty() && tilts_rad.len() != n {
+            let found = tilts_rad.len();
+            return Err(ArmError::WrongLength {
+                what: "tilts",
+                expected: n,
+                found,
+            });
+        }
+        finite("tilt_rad", &tilts_rad)?;
+        if tilts_rad.iter().all(|t| *t == 0.0) {
+            tilts_rad.clear();
+        }
         for (joint, l) in limits.iter().enumerate() {
             let bad = |what, value, expected| ArmError::BadLimit {
                 joint,
@@ -235,12 +168,13 @@ impl Arm {
             let ([sine, _], [cosine, _]) = sin_cos(&[half, 0.0], 1);
             HalfTwist { sine, cosine }
         });
-        let family = Family::of(&rows);
+        let family = Family::of(&rows, &tilts_rad);
         Ok(Self {
             rows,
             limits,
             links,
             half_twists,
+            tilts_rad,
             family,
         })
     }
@@ -253,6 +187,17 @@ impl Arm {
     /// The Denavit-Hartenberg rows, from the base outwards.
     pub fn rows(&self) -> &[DhRow] {
         &self.rows
+    }
+
+    /// The turns that follow the rows, radians, from the base outwards; none if all are zero.
+    pub fn tilts_rad(&self) -> &[f64] {
+        &self.tilts_rad
+    }
+
+    /// The longest distance that the tool point can have from the base, metres, for a tip at this
+    /// distance from the last link's origin: all lengths added up, so that nothing lies beyond.
+    pub fn reach_m(&self, tip_m: f64) -> f64 {
+        self.rows.iter().map(|r| r.a_m.hypot(r.d_m)).sum::<f64>() + tip_m
     }
 
     /// The joint limits, from the base outwards.
@@ -294,6 +239,9 @@ impl Arm {
     /// [`ArmError`] when `q` has the wrong length or a value that is not finite.
     #[inline]
     pub fn forward(&self, q: &[f64]) -> Result<Isometry3<f64>, ArmError> {
+        if !self.tilts_rad.is_empty() {
+            return self.tilted_forward(q);
+        }
         match q.len() {
             4 => self.forward_of::<4>(q),
             5 => self.forward_of::<5>(q),
@@ -335,9 +283,44 @@ impl Arm {
         ))
     }
 
+    /// [`Self::forward`] with tilts.
+    #[cold]
+    pub(crate) fn tilted_forward(&self, q: &[f64]) -> Result<Isometry3<f64>, ArmError> {
+        Ok(self.link_poses(q)?[self.rows.len()])
+    }
+
+    /// [`Self::frames`] with tilts.
+    #[cold]
+    fn tilted_frames(&self, q: &[f64]) -> Result<Frames, ArmError> {
+        let poses = self.link_poses(q)?;
+        let mut frames = Frames {
+            count: self.rows.len(),
+            x: [Vector3::x(); PADDED],
+            z: [Vector3::z(); PADDED],
+            origin: [Vector3::zeros(); PADDED],
+        };
+        for (i, pose) in poses.iter().enumerate() {
+            frames.x[i] = pose.rotation * Vector3::x();
+            frames.z[i] = pose.rotation * Vector3::z();
+            frames.origin[i] = pose.translation.vector;
+        }
+        Ok(frames)
+    }
+
+    /// The x axis of row `i` (from 0) before its tilt: the one it turns about by its twist.
+    pub(crate) fn twist_axis(&self, frames: &Frames, i: usize) -> Vector3<f64> {
+        match self.tilts_rad.get(i) {
+            None => frames.x[i + 1],
+            Some(tilt) => frames.x[i + 1] * tilt.cos() + frames.z[i + 1] * tilt.sin(),
+        }
+    }
+
     /// Axes and origins of all frames.
     #[inline]
     pub(crate) fn frames(&self, q: &[f64]) -> Result<Frames, ArmError> {
+        if !self.tilts_rad.is_empty() {
+            return self.tilted_frames(q);
+        }
         let n = self.rows.len();
         let (sine, cosine) = sin_cos(&self.angles(q)?, n);
         let mut frames = Frames {
@@ -390,6 +373,9 @@ impl Arm {
                     s * half.cosine,
                 )),
             );
+            if let Some(&tilt) = self.tilts_rad.get(joint) {
+                pose.rotation *= UnitQuaternion::from_axis_angle(&Vector3::y_axis(), tilt);
+            }
             poses.push(pose);
         }
         Ok(poses)
@@ -453,6 +439,6 @@ impl Arm {
                 alpha_rad: row.alpha_rad + e[3],
             })
             .collect();
-        Self::new(rows, self.limits.clone())
+        Self::with_tilts(rows, self.tilts_rad.clone(), self.limits.clone())
     }
 }

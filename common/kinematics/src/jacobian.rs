@@ -1,6 +1,7 @@
 //! How a point of the last link moves with the joints.
 
-use crate::arm::{Arm, ArmError, MAX_JOINTS};
+use crate::arm::{Arm, MAX_JOINTS};
+use crate::rows::ArmError;
 use crate::trig::sin_cos;
 use nalgebra::{Isometry3, Matrix6xX, Quaternion, SMatrix, UnitQuaternion, Vector3};
 
@@ -40,12 +41,34 @@ impl Arm {
         point_in_link: &Vector3<f64>,
         jacobian: &mut JacobianBuffer,
     ) -> Result<Isometry3<f64>, ArmError> {
+        if !self.tilts_rad().is_empty() {
+            return self.tilted_with_jacobian(q, point_in_link, jacobian);
+        }
         match q.len() {
             4 => self.with_jacobian_of::<4>(q, point_in_link, jacobian),
             5 => self.with_jacobian_of::<5>(q, point_in_link, jacobian),
             6 => self.with_jacobian_of::<6>(q, point_in_link, jacobian),
             _ => self.with_jacobian_of::<7>(q, point_in_link, jacobian),
         }
+    }
+
+    /// [`Self::forward_with_jacobian`] with tilts.
+    #[cold]
+    fn tilted_with_jacobian(
+        &self,
+        q: &[f64],
+        point_in_link: &Vector3<f64>,
+        jacobian: &mut JacobianBuffer,
+    ) -> Result<Isometry3<f64>, ArmError> {
+        let frames = self.frames(q)?;
+        let point = frames.origin[frames.count] + frames.rotate(point_in_link);
+        for joint in 0..frames.count {
+            let axis = frames.z[joint];
+            let linear = axis.cross(&(point - frames.origin[joint]));
+            jacobian.fixed_view_mut::<3, 1>(0, joint).copy_from(&linear);
+            jacobian.fixed_view_mut::<3, 1>(3, joint).copy_from(&axis);
+        }
+        self.tilted_forward(q)
     }
 
     /// [`Self::forward_with_jacobian`] for `N` joints, so that the compiler unrolls it.

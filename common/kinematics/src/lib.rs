@@ -11,6 +11,7 @@
 //! | [`Arm`] | where is each link, how does it move with the joints |
 //! | [`Tool`] | where on the last link is the instrument, and which way does it point |
 //! | [`solve_axis`], [`closest_solution`], [`solve_numeric`] | which joint angles put the tool point on a point with a given approach axis |
+//! | [`solve_pose`], [`closest_pose`], [`all_poses`] | which joint angles put a frame of the last link on a pose |
 //! | [`pose_error_jacobian`] | how does the predicted pose change with the errors of the model |
 //! | [`JointTrajectory`] | is a motion within the limits of the joints, and the quickest that is |
 //!
@@ -21,20 +22,23 @@ mod arm;
 mod inverse;
 mod jacobian;
 mod model_error;
+mod rows;
 mod tool;
 mod trajectory;
 mod trig;
 
-pub use arm::{Arm, ArmError, DhRow, JointLimits, LIMIT_TOLERANCE_RAD, MAX_JOINTS, MIN_JOINTS};
+pub use arm::{Arm, LIMIT_TOLERANCE_RAD, MAX_JOINTS, MIN_JOINTS};
 pub use inverse::{
     AxisGoal, Branch, Constraint, Elbow, FamilyMismatch, IkError, IkSolution, LimitViolation,
-    NumericOptions, Shoulder, Wrist, closest_solution, solve_axis, solve_numeric,
+    NumericOptions, PoseGoal, Shoulder, Wrist, all_poses, all_solutions, closest_pose,
+    closest_solution, solve_axis, solve_numeric, solve_pose,
 };
 pub use jacobian::JacobianBuffer;
 pub use model_error::{
     ERRORS_PER_JOINT, MOUNT_PARAMETERS, point_error_jacobian, pose_error_jacobian,
     pose_error_jacobian_with_mount,
 };
+pub use rows::{ArmError, DhRow, JointLimits};
 pub use tool::Tool;
 pub use trajectory::{
     JointTrajectory, Quantity, TimingOptions, TrajectoryError, TrajectoryPoint, through,

@@ -6,7 +6,8 @@
 //! are exact derivatives: a change of row `i` moves everything beyond it as a screw does, about
 //! `z_{i-1}` through `o_{i-1}` (theta, d) or about `x_i` through `o_i` (alpha, a).
 
-use crate::arm::{Arm, ArmError, Frames, finite};
+use crate::arm::{Arm, Frames};
+use crate::rows::{ArmError, finite};
 use nalgebra::{Matrix3xX, Matrix6xX, Vector3};
 
 /// Model errors per joint: theta (rad), d (m), a (m), alpha (rad).
@@ -17,8 +18,8 @@ pub const MOUNT_PARAMETERS: usize = 6;
 const NONE: Vector3<f64> = Vector3::new(0.0, 0.0, 0.0);
 
 /// The four (linear, angular) columns of joint `i` for the point `p`.
-fn columns(f: &Frames, i: usize, p: &Vector3<f64>) -> [(Vector3<f64>, Vector3<f64>); 4] {
-    let (z, x) = (f.z[i], f.x[i + 1]);
+fn columns(arm: &Arm, f: &Frames, i: usize, p: &Vector3<f64>) -> [(Vector3<f64>, Vector3<f64>); 4] {
+    let (z, x) = (f.z[i], arm.twist_axis(f, i));
     [
         (z.cross(&(p - f.origin[i])), z),
         (z, NONE),
@@ -51,7 +52,7 @@ pub fn point_error_jacobian(
     let (frames, point) = frames_and_point(arm, q, point_in_link)?;
     let mut jacobian = Matrix3xX::zeros(ERRORS_PER_JOINT * frames.count);
     for i in 0..frames.count {
-        for (k, (linear, _)) in columns(&frames, i, &point).iter().enumerate() {
+        for (k, (linear, _)) in columns(arm, &frames, i, &point).iter().enumerate() {
             jacobian.set_column(ERRORS_PER_JOINT * i + k, linear);
         }
     }
@@ -71,7 +72,7 @@ pub fn pose_error_jacobian(
 ) -> Result<Matrix6xX<f64>, ArmError> {
     let (frames, point) = frames_and_point(arm, q, point_in_link)?;
     let mut jacobian = Matrix6xX::zeros(ERRORS_PER_JOINT * frames.count);
-    fill_pose(&frames, &point, &mut jacobian);
+    fill_pose(arm, &frames, &point, &mut jacobian);
     Ok(jacobian)
 }
 
@@ -94,7 +95,7 @@ pub fn pose_error_jacobian_with_mount(
     let (frames, point) = frames_and_point(arm, q, point_in_link)?;
     let arm_columns = ERRORS_PER_JOINT * frames.count;
     let mut jacobian = Matrix6xX::zeros(arm_columns + MOUNT_PARAMETERS);
-    fill_pose(&frames, &point, &mut jacobian);
+    fill_pose(arm, &frames, &point, &mut jacobian);
     let lever = point - mount_centre;
     jacobian
         .fixed_view_mut::<3, 3>(0, arm_columns)
@@ -108,9 +109,9 @@ pub fn pose_error_jacobian_with_mount(
     Ok(jacobian)
 }
 
-fn fill_pose(frames: &Frames, point: &Vector3<f64>, jacobian: &mut Matrix6xX<f64>) {
+fn fill_pose(arm: &Arm, frames: &Frames, point: &Vector3<f64>, jacobian: &mut Matrix6xX<f64>) {
     for i in 0..frames.count {
-        for (k, (linear, angular)) in columns(frames, i, point).iter().enumerate() {
+        for (k, (linear, angular)) in columns(arm, frames, i, point).iter().enumerate() {
             let column = ERRORS_PER_JOINT * i + k;
             jacobian.fixed_view_mut::<3, 1>(0, column).copy_from(linear);
             jacobian

@@ -1,7 +1,8 @@
 //! The instrument on the last link.
 
-use crate::arm::{Arm, ArmError};
-use nalgebra::{Isometry3, Unit, Vector3};
+use crate::arm::Arm;
+use crate::rows::ArmError;
+use nalgebra::{Isometry3, Quaternion, Unit, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 /// The instrument: its tool point and its approach axis, both in the last link's frame.
@@ -25,6 +26,24 @@ impl Tool {
             tip_in_link: axis.into_inner() * length_m,
             axis_in_link: axis,
         }
+    }
+
+    /// The tool's frame on the last link: origin at the tip, z along the approach axis, turned from
+    /// the link's own frame by the shortest way (about y where the axis points back). For the turret
+    /// of the Mars Exploration Rover this is the tool frame of its flight software.
+    pub fn frame(&self) -> Isometry3<f64> {
+        let v = self.axis_in_link;
+        // Half-angle form: exact for an axis next to z, where an arc cosine is not.
+        let onto = |x: f64, y: f64, z: f64| {
+            UnitQuaternion::from_quaternion(Quaternion::new(1.0 + z, -y, x, 0.0))
+        };
+        let turn = if v.z > -1.0 + 1e-9 {
+            onto(v.x, v.y, v.z)
+        } else {
+            onto(-v.x, -v.y, -v.z)
+                * UnitQuaternion::new_unchecked(Quaternion::new(0.0, 0.0, 1.0, 0.0))
+        };
+        Isometry3::from_parts(self.tip_in_link.into(), turn)
     }
 
     /// Tool point (metres) and approach axis (unit) for a given pose of the last link, in the

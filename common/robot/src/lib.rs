@@ -2,11 +2,14 @@
 //! postures and stated calibration quality. Services believe it; the simulator perturbs its own
 //! copy.
 //!
+//! Arms can also be read from URDF files: [`urdf`].
+//!
 //! Every field is checked when a file is read and the message names the field, what was found and
 //! what was expected; unknown fields are refused.
 
 mod description;
 mod robot;
+pub mod urdf;
 
 pub use description::{
     ArmDescription, CameraPairDescription, Capsule, ContactSwitch, Dynamics, FiducialDescription,

@@ -86,7 +86,21 @@ impl Robot {
             origin: origin.into(),
             message: e.to_string(),
         })?;
-        Self::new(description, origin)
+        Self::new(description, origin).map_err(|error| match error {
+            RobotError::Field {
+                origin,
+                field,
+                message,
+            } => RobotError::Field {
+                origin: match line_of(text, &field) {
+                    Some(line) => format!("{origin}:{line}"),
+                    None => origin,
+                },
+                field,
+                message,
+            },
+            other => other,
+        })
     }
 
     /// Checks a description.
@@ -216,6 +230,35 @@ pub(crate) fn pose(p: &PoseDescription) -> Isometry3<f64> {
 
 fn list<'a>(names: impl Iterator<Item = &'a str>) -> String {
     names.collect::<Vec<_>>().join(", ")
+}
+
+/// The line, from 1, of a field like `arm.joints[2].shape` in a TOML text, or of what encloses it.
+fn line_of(text: &str, field: &str) -> Option<usize> {
+    use toml::de::{DeTable, DeValue};
+    let root = DeTable::parse(text).ok()?;
+    let mut offset = None;
+    let mut table = Some(root.get_ref());
+    for step in field.split('.') {
+        let (key, index) = match step.split_once('[') {
+            Some((key, rest)) => (key, rest.trim_end_matches(']').parse::<usize>().ok()),
+            None => (step, None),
+        };
+        let Some((name, mut value)) = table.and_then(|t| t.get_key_value(key)) else {
+            break;
+        };
+        offset = Some(name.span().start);
+        if let (Some(index), DeValue::Array(items)) = (index, value.get_ref())
+            && let Some(item) = items.get(index)
+        {
+            value = item;
+            offset = Some(item.span().start);
+        }
+        table = match value.get_ref() {
+            DeValue::Table(inner) => Some(inner),
+            _ => None,
+        };
+    }
+    Some(text.get(..offset?)?.matches('\n').count() + 1)
 }
 
 struct Check<'a> {

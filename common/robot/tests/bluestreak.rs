@@ -81,3 +81,41 @@ fn an_unknown_name_is_answered_with_the_known_ones() {
         "no posture named `home`; the robot has: ready, stow"
     );
 }
+
+#[test]
+fn a_field_that_cannot_be_is_named_with_its_line() {
+    for (from, to, part) in [
+        ("heartbeat_s = 0.02", "heartbeat_s = 2.0", "heartbeat_s"),
+        ("travel_m = 0.004", "travel_m = 0.001", "travel_m"),
+        ("stow = [-1.5,", "stow = [-3.5,", "stow"),
+    ] {
+        let line = BLUESTREAK
+            .lines()
+            .position(|l| l.contains(from))
+            .map(|i| i + 1)
+            .unwrap();
+        let message = parse(from, to).unwrap_err().to_string();
+        let expected = format!("robot.toml:{line}: ");
+        assert!(
+            message.starts_with(&expected) && message.contains(part),
+            "{expected} {message}"
+        );
+    }
+}
+
+proptest::proptest! {
+    #![proptest_config(proptest::prelude::ProptestConfig::with_cases(150))]
+    #[test]
+    fn a_damaged_robot_file_is_read_or_refused_by_name(
+        at in 0.0..1.0f64, length in 0usize..40, with in "[ -~\n]{0,10}",
+    ) {
+        let bytes = BLUESTREAK.as_bytes();
+        let start = (at * bytes.len() as f64) as usize;
+        let end = (start + length).min(bytes.len());
+        let damaged = [&bytes[..start], with.as_bytes(), &bytes[end..]].concat();
+        let text = String::from_utf8_lossy(&damaged);
+        if let Err(error) = Robot::parse(&text, "robot.toml") {
+            proptest::prop_assert!(error.to_string().starts_with("robot.toml"), "{}", error);
+        }
+    }
+}

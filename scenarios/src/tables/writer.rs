@@ -79,7 +79,7 @@ impl TableWriter {
     ) -> Result<(), TableError> {
         let numbers = match &answer {
             Ok(numbers) => numbers.as_ref(),
-            Err(reason) => return self.refuse(&reason.to_string()),
+            Err(reason) => return self.refuse_after(&[], &reason.to_string()),
         };
         if numbers.len() != self.columns {
             return Err(TableError::Answer {
@@ -89,14 +89,26 @@ impl TableWriter {
             });
         }
         if numbers.iter().any(|n| !n.is_finite()) {
-            return self.refuse("the answer is not finite");
+            return self.refuse_after(&[], "the answer is not finite");
         }
         let cells: Vec<String> = numbers.iter().map(|&n| shortest(n)).collect();
         self.answered += 1;
         self.record(cells.iter().map(String::as_str).chain([OK]))
     }
 
-    fn refuse(&mut self, reason: &str) -> Result<(), TableError> {
+    /// Writes a row without an answer, whose first cells are known all the same: the number of the
+    /// row that was asked about, say.
+    ///
+    /// # Errors
+    /// As [`answer`](Self::answer).
+    pub fn refuse_after(&mut self, known: &[f64], reason: &str) -> Result<(), TableError> {
+        if known.len() > self.columns {
+            return Err(TableError::Answer {
+                file: self.file.clone(),
+                found: known.len(),
+                expected: self.columns,
+            });
+        }
         // One row, one line; and a refusal never reads as an answer.
         let reason = reason.split_whitespace().collect::<Vec<_>>().join(" ");
         let reason = if reason.is_empty() || reason == OK {
@@ -105,7 +117,15 @@ impl TableWriter {
             &reason
         };
         self.refused += 1;
-        self.record(std::iter::repeat_n("", self.columns).chain([reason]))
+        let known: Vec<String> = known.iter().map(|&n| shortest(n)).collect();
+        let empty = std::iter::repeat_n("", self.columns - known.len());
+        self.record(
+            known
+                .iter()
+                .map(String::as_str)
+                .chain(empty)
+                .chain([reason]),
+        )
     }
 
     fn record<'a>(&mut self, cells: impl Iterator<Item = &'a str>) -> Result<(), TableError> {

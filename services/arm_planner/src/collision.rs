@@ -41,6 +41,9 @@ pub struct Margins {
     /// Between the last link and the terrain: bounded so that the instrument can stand 3 cm
     /// before a surface.
     pub instrument: MarginBounds,
+    /// Between the last link and the terrain where the instrument may touch, m: a fixed distance,
+    /// kept by all of the link but the tool near its tip.
+    pub touching_m: f64,
 }
 
 impl Default for Margins {
@@ -52,6 +55,7 @@ impl Default for Margins {
             body: bounds(0.005, 0.02),
             terrain: bounds(0.01, 0.05),
             instrument: bounds(0.01, 0.02),
+            touching_m: 0.003,
         }
     }
 }
@@ -80,7 +84,9 @@ pub struct Proximity {
     pub at: Vector3<f64>,
 }
 
-/// A ball in which the instrument may touch the terrain.
+/// A ball in which the instrument may touch the terrain: while the tip is inside, what lies within
+/// [`TOOL_REACH_M`] of it is not checked against the terrain, and the rest of the last link keeps
+/// [`Margins::touching_m`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ContactZone {
     /// Its centre, rover frame, m.
@@ -122,6 +128,9 @@ pub(crate) struct Placed {
     pub tip: Vector3<f64>,
 }
 
+/// How far from the tip the last link is the tool, which may touch, m: the plunger and the end of the
+/// barrel that carries it.
+pub const TOOL_REACH_M: f64 = 0.05;
 /// Length of the plunger's capsule behind the tip, m.
 const PLUNGER_M: f64 = 0.02;
 
@@ -281,12 +290,24 @@ impl CollisionModel {
         let last = self.robot.arm.joint_count();
         let in_zone = zone.is_some_and(|z| (placed.tip - z.centre).norm() <= z.radius_m);
         for (a, shape) in self.shapes.iter().enumerate() {
-            if in_zone && shape.link == last {
-                continue;
+            let look_m = look_m + shape.radius_m;
+            let core = &placed.cores[a];
+            let touches = in_zone && shape.link == last;
+            let closest = if touches {
+                let parts = core.outside_ball(&placed.tip, TOOL_REACH_M);
+                let parts = parts.iter().flatten();
+                parts
+                    .filter_map(|part| map.closest(part, look_m))
+                    .min_by(|a, b| a.distance_m.total_cmp(&b.distance_m))
+            } else {
+                map.closest(core, look_m)
+            };
+            let Some(closest) = closest else { continue };
+            let mut found = self.proximity(Pair::Terrain(a), placed, &closest, shape.radius_m);
+            if touches {
+                found.required_m = self.margins.touching_m;
             }
-            if let Some(closest) = map.closest(&placed.cores[a], look_m + shape.radius_m) {
-                visit(self.proximity(Pair::Terrain(a), placed, &closest, shape.radius_m));
-            }
+            visit(found);
         }
     }
 

@@ -94,6 +94,30 @@ impl Segment {
         }
     }
 
+    /// The parts of the segment outside a ball: none, one, or one on either side of it.
+    pub fn outside_ball(&self, centre: &Vector3<f64>, radius_m: f64) -> [Option<Self>; 2] {
+        let d = self.to - self.from;
+        let offset = self.from - centre;
+        let (a, b) = (d.norm_squared(), d.dot(&offset));
+        let c = offset.norm_squared() - radius_m * radius_m;
+        let discriminant = b * b - a * c;
+        if a == 0.0 || discriminant <= 0.0 {
+            return [(c > 0.0).then_some(*self), None];
+        }
+        let root = discriminant.sqrt();
+        let (enters, leaves) = ((-b - root) / a, (-b + root) / a);
+        let part = |from: f64, to: f64| {
+            (from < to).then(|| Self {
+                from: self.at(from),
+                to: self.at(to),
+            })
+        };
+        if enters >= 1.0 || leaves <= 0.0 {
+            return [Some(*self), None];
+        }
+        [part(0.0, enters), part(leaves, 1.0)]
+    }
+
     /// Nearest points of the segment and a column; distance 0 if they meet.
     ///
     /// Along the segment the squared distance to the column is convex and piecewise quadratic;

@@ -425,3 +425,60 @@ proptest! {
         }
     }
 }
+
+/// The plate is thin: where its bounding ball would touch the forearm, the plate itself does not.
+#[test]
+fn the_fiducial_is_shown_on_the_side_of_the_shoulder_too() {
+    let robot = bluestreak();
+    let planner = planner_over(&robot, &terrain(|_, _| GROUND_M));
+    let start = robot.posture("ready").unwrap();
+    for y in [0.1, 0.15, 0.2] {
+        let goal = PlanGoal::Tool {
+            pose: pose(0.5, y, GROUND_M + 0.06, DOWN),
+            visible_to: Some("body".into()),
+        };
+        let plan = planner.plan(&ask(goal), start).unwrap();
+        assert_sound(&robot, &plan, start);
+    }
+}
+
+/// Only the tool near its tip may touch: in a hole that is too narrow for it, the rest of the last
+/// link is in the way.
+#[test]
+fn contact_excuses_the_tip_and_not_the_whole_instrument() {
+    let robot = bluestreak();
+    let hole = |radius: f64| {
+        move |x: f64, y: f64| {
+            let beside = f64::hypot(x - 0.5, y);
+            if beside < radius {
+                GROUND_M
+            } else {
+                GROUND_M + 0.1
+            }
+        }
+    };
+    let down = PlanRequest {
+        contact_radius_m: 0.2,
+        ..ask(PlanGoal::Straight(vec![pose(0.5, 0.0, GROUND_M, DOWN)]))
+    };
+    let above = PlanGoal::Tool {
+        pose: pose(0.5, 0.0, GROUND_M + 0.16, DOWN),
+        visible_to: None,
+    };
+    for (radius, fits) in [(0.035, false), (0.2, true)] {
+        let planner = planner_over(&robot, &terrain(hole(radius)));
+        let start = planner
+            .plan(&ask(above.clone()), robot.posture("ready").unwrap())
+            .unwrap()
+            .end_rad;
+        match planner.plan(&down, &start) {
+            Ok(_) => assert!(fits, "{radius}"),
+            Err(fault) => {
+                assert!(!fits, "{radius}: {fault}");
+                assert_eq!(fault.name, "no_collision_free_path");
+                assert!(fault.message.contains("`turret`"), "{fault}");
+                assert!(fault.message.contains("terrain"), "{fault}");
+            }
+        }
+    }
+}

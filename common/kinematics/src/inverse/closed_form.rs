@@ -15,10 +15,10 @@
 //! plane arm of two links with its elbow to either side.
 //!
 //! The twists of the rows are only nearly multiples of pi/2, so every branch is then corrected on
-//! the true rows: see [`super::polish`].
+//! the true rows: see [`super::polish`]. [`super::branches`] goes through them.
 
 use super::family::{Family, TurretTool};
-use super::{AxisGoal, Branch, Constraint, Elbow, IkError, Shoulder, Wrist, is_usable};
+use super::{AxisGoal, Constraint, Elbow, IkError, Shoulder};
 use crate::arm::{Arm, Link};
 use crate::tool::Tool;
 use crate::trig::{atan2, sin_cos};
@@ -27,16 +27,12 @@ use std::f64::consts::PI;
 
 /// Sine of `psi` below which the axis counts as parallel to the bending axis.
 pub(super) const PARALLEL: f64 = 1e-6;
-/// Sine of the elbow, and cosine at the shoulder, below which two branches count as one.
-const COINCIDENT: f64 = 1e-5;
-/// The same before polishing: below it the true rows are asked.
-const NEARLY_COINCIDENT: f64 = 1e-2;
 /// Distance from the first axis at which joint 0 is free, metres.
 const ON_AXIS_M: f64 = 1e-9;
 
 /// What is chosen where the goal leaves it free: the angles of `near`, the plane angle plus a turn.
 #[derive(Clone, Copy)]
-pub(crate) struct Preferred<'a> {
+pub(super) struct Preferred<'a> {
     pub near: &'a [f64],
     pub turn_rad: f64,
 }
@@ -122,7 +118,7 @@ pub(super) struct Solver<'a> {
 }
 
 impl<'a> Solver<'a> {
-    fn new(
+    pub fn new(
         arm: &'a Arm,
         tool: &'a Tool,
         goal: &'a AxisGoal,
@@ -213,7 +209,7 @@ impl<'a> Solver<'a> {
     }
 
     /// The hand where the axis is parallel to the bending axis and the plane angle is free.
-    fn free_hand(&self, side: &Side, hand: &Hand) -> Result<Hand, Edge> {
+    pub fn free_hand(&self, side: &Side, hand: &Hand) -> Result<Hand, Edge> {
         let hint = self.preferred.map(|p| {
             let sum = (1..4)
                 .map(|i| p.near[i] + self.family.offsets[i])
@@ -240,7 +236,7 @@ impl<'a> Solver<'a> {
 
     /// How far beyond the plane arm's edges a branch is still tried, metres: what the rows lack
     /// turns joint 0, and with it the plane angle, the more the nearer both are to singular.
-    fn plane_margin(&self, side: &Side, hand: &Hand) -> f64 {
+    pub fn plane_margin(&self, side: &Side, hand: &Hand) -> f64 {
         let turn = self.margin + side.blur / side.forward.abs().max(1e-3);
         let plane_angle = (turn / hand.sin_psi.abs().max(1e-12)).min(2.0);
         self.margin + side.blur + self.normal.abs() * plane_angle
@@ -333,91 +329,6 @@ impl<'a> Solver<'a> {
             is_irregular: side.is_moved || plane.is_moved || hand.sin_psi == 0.0,
         }
     }
-
-    /// Whether front and back coincide, given the polished angle of joint 0.
-    #[inline]
-    fn is_on_shoulder_edge(&self, side: &Side, w: &Vector3<f64>, theta1: f64) -> bool {
-        let rho = w.x.hypot(w.y);
-        let (s, c) = theta1.sin_cos();
-        side.forward == 0.0 || (w.x * c + w.y * s).abs() < COINCIDENT * rho
-    }
-
-    fn run(&self, found: &mut impl FnMut(&[f64], Branch, bool)) -> Result<(), IkError> {
-        let w = self.point - self.axis * self.turret.length;
-        let mut least: Option<Edge> = None;
-        let mut fails = |(constraint, by_m): Edge| {
-            if least.is_none_or(|(_, other)| by_m < other) {
-                least = Some((constraint, by_m));
-            }
-        };
-        let mut any = false;
-        for shoulder in [Shoulder::Front, Shoulder::Back] {
-            let side = match self.side(shoulder, &w, self.margin) {
-                Ok(side) => side,
-                Err(edge) => {
-                    fails(edge);
-                    break;
-                }
-            };
-            let on_axis = side.forward == 0.0;
-            let is_near_edge = side.forward.abs() < NEARLY_COINCIDENT * w.xy().norm() || on_axis;
-            let hand = self.hand(&side, &self.axis);
-            let is_parallel = hand.sin_psi < PARALLEL;
-            for wrist in [Wrist::Positive, Wrist::Negative] {
-                let hand = match (is_parallel, wrist) {
-                    (false, Wrist::Positive) => hand,
-                    (false, Wrist::Negative) => hand.flipped(),
-                    (true, Wrist::Negative) => break,
-                    (true, Wrist::Positive) => match self.free_hand(&side, &hand) {
-                        Ok(hand) => hand,
-                        Err(edge) => {
-                            fails(edge);
-                            break;
-                        }
-                    },
-                };
-                let plane = match self.plane(&side, &hand, self.plane_margin(&side, &hand)) {
-                    Ok(plane) => plane,
-                    Err(edge) => {
-                        fails(edge);
-                        continue;
-                    }
-                };
-                for elbow in [Elbow::Positive, Elbow::Negative] {
-                    let branch = Branch {
-                        shoulder,
-                        wrist,
-                        elbow,
-                    };
-                    let posture = self.posture(&side, &hand, &plane, elbow);
-                    let theta = match self.polish(&posture, branch) {
-                        Ok(theta) => theta,
-                        Err(by_m) => {
-                            fails((posture.nearest_edge(), by_m));
-                            continue;
-                        }
-                    };
-                    let meets_front = is_near_edge && self.is_on_shoulder_edge(&side, &w, theta[0]);
-                    let meets_elbow =
-                        plane.sine < NEARLY_COINCIDENT && theta[2].sin().abs() < COINCIDENT;
-                    any = true;
-                    if !meets_front || on_axis || shoulder == Shoulder::Front {
-                        let joints: [f64; 5] =
-                            std::array::from_fn(|i| theta[i] - self.family.offsets[i]);
-                        found(&joints, branch, meets_front || meets_elbow || is_parallel);
-                    }
-                    if meets_elbow {
-                        break;
-                    }
-                }
-            }
-        }
-        match (any, least) {
-            (true, _) => Ok(()),
-            (false, Some((constraint, by_m))) => Err(IkError::OutOfReach { constraint, by_m }),
-            (false, None) => Err(IkError::NotFinite),
-        }
-    }
 }
 
 impl Hand {
@@ -435,7 +346,7 @@ impl Hand {
 
 impl Posture {
     /// The edge of reach to which this posture is closest.
-    fn nearest_edge(&self) -> Constraint {
+    pub fn nearest_edge(&self) -> Constraint {
         let (upper, fore) = (self.upper, self.fore);
         if self.side.forward.abs() < 1e-2 {
             Constraint::ShoulderOffset
@@ -445,51 +356,6 @@ impl Posture {
             Constraint::ArmFolded
         }
     }
-}
-
-/// Calls `found` with joint angles, branch and singularity of every posture that meets `goal`.
-pub(crate) fn solve(
-    arm: &Arm,
-    tool: &Tool,
-    goal: &AxisGoal,
-    preferred: Option<Preferred<'_>>,
-    mut found: impl FnMut(&[f64], Branch, bool),
-) -> Result<(), IkError> {
-    if !is_usable(tool, goal) {
-        return Err(IkError::NotFinite);
-    }
-    Solver::new(arm, tool, goal, preferred)?.run(&mut found)
-}
-
-/// The branch of given joint angles.
-pub(crate) fn branch_of(arm: &Arm, tool: &Tool, q: &[f64]) -> Result<Branch, IkError> {
-    let theta = arm.angles(q)?;
-    let goal = AxisGoal::at(arm, tool, q)?;
-    let solver = Solver::new(arm, tool, &goal, None)?;
-    let (f, turret) = (solver.family, solver.turret);
-    let w = goal.point - goal.axis.into_inner() * turret.length;
-    let ([s1, sin_psi, sin_elbow, _], [c1, ..]) = sin_cos(
-        &[theta[0], theta[4] + turret.ahead, f.bend * theta[2], 0.0],
-        3,
-    );
-    let pick = |value: f64| value >= 0.0;
-    Ok(Branch {
-        shoulder: if pick(w.x * c1 + w.y * s1) {
-            Shoulder::Front
-        } else {
-            Shoulder::Back
-        },
-        wrist: if pick(sin_psi) {
-            Wrist::Positive
-        } else {
-            Wrist::Negative
-        },
-        elbow: if pick(sin_elbow * f.upper * f.fore) {
-            Elbow::Positive
-        } else {
-            Elbow::Negative
-        },
-    })
 }
 
 /// The plane angle where the goal leaves it free. The wrist then lies anywhere on a circle of

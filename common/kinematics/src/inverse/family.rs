@@ -1,6 +1,7 @@
 //! The family of arms that has a closed form, recognised from the rows and the tool.
 
-use crate::arm::{DhRow, Link};
+use crate::arm::Link;
+use crate::rows::DhRow;
 use crate::tool::Tool;
 use crate::trig::atan2;
 use std::f64::consts::FRAC_PI_2;
@@ -85,7 +86,7 @@ pub(crate) struct TurretTool {
 }
 
 impl Family {
-    pub(crate) fn of(rows: &[DhRow]) -> Result<Self, FamilyMismatch> {
+    pub(crate) fn of(rows: &[DhRow], tilts_rad: &[f64]) -> Result<Self, FamilyMismatch> {
         let miss = |parameter, joint, value, expected| {
             Err(FamilyMismatch {
                 parameter,
@@ -96,6 +97,9 @@ impl Family {
         };
         if rows.len() != 5 {
             return miss("number of joints", None, rows.len() as f64, "5");
+        }
+        if let Some(joint) = tilts_rad.iter().position(|t| *t != 0.0) {
+            return miss("tilt_rad", Some(joint), tilts_rad[joint], "0");
         }
         for joint in [0, 3, 4] {
             let alpha = rows[joint].alpha_rad;

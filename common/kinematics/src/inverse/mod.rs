@@ -6,16 +6,20 @@
 //! 4 to 7 joints is solved by damped least squares ([`solve_numeric`]). Whatever fails says which
 //! constraint fails, and by how much.
 
+mod branches;
 mod closed_form;
 pub(crate) mod family;
+mod multistart;
 mod numeric;
 mod polish;
 
-use crate::arm::{Arm, ArmError, LIMIT_TOLERANCE_RAD, MAX_JOINTS};
+use crate::arm::{Arm, LIMIT_TOLERANCE_RAD, MAX_JOINTS};
+use crate::rows::ArmError;
 use crate::tool::Tool;
 pub use family::FamilyMismatch;
+pub use multistart::{all_poses, all_solutions, closest_pose};
 use nalgebra::{Unit, Vector3};
-pub use numeric::{NumericOptions, solve_numeric};
+pub use numeric::{NumericOptions, PoseGoal, solve_numeric, solve_pose};
 use std::f64::consts::{PI, TAU};
 use std::fmt;
 
@@ -133,7 +137,7 @@ pub enum IkError {
         by_m: f64,
     },
     /// The point is reached, but the axis cannot be turned as asked.
-    #[error("the point is reachable but the approach axis misses by {:.3} deg", by_rad.to_degrees())]
+    #[error("the point is reachable but the approach axis (for a pose: the orientation) misses by {:.3} deg", by_rad.to_degrees())]
     AxisInfeasible {
         /// Smallest angle found between the wanted and a possible axis, radians.
         by_rad: f64,
@@ -159,7 +163,7 @@ pub enum IkError {
     /// The numeric solver stopped short of the goal.
     #[error(
         "no joint angles found: after {iterations} iterations the tool point is {:.6} mm and the \
-         axis {:.6} deg from the goal", position_error_m * 1e3, axis_error_rad.to_degrees()
+         direction {:.6} deg from the goal", position_error_m * 1e3, axis_error_rad.to_degrees()
     )]
     NoConvergence {
         /// Distance of the tool point from the goal, metres.
@@ -253,7 +257,7 @@ impl Branch {
     /// [`IkError::NotThisFamily`] for another arm or tool, [`IkError::Arm`] for angles that do
     /// not fit the arm.
     pub fn of(arm: &Arm, tool: &Tool, q: &[f64]) -> Result<Self, IkError> {
-        closed_form::branch_of(arm, tool, q)
+        branches::branch_of(arm, tool, q)
     }
 }
 
@@ -345,7 +349,7 @@ impl From<LimitViolation> for IkError {
 /// [`IkError::OutOfReach`] when no posture reaches, [`IkError::NotFinite`] for unusable numbers.
 pub fn solve_axis(arm: &Arm, tool: &Tool, goal: &AxisGoal) -> Result<Vec<IkSolution>, IkError> {
     let mut solutions = Vec::with_capacity(8);
-    closed_form::solve(arm, tool, goal, None, |joints, branch, singular| {
+    branches::solve(arm, tool, goal, None, |joints, branch, singular| {
         let mut joints_rad = joints.to_vec();
         let limit_violation = normalise(arm, &mut joints_rad, None);
         let within_limits = limit_violation.is_none();
@@ -387,7 +391,7 @@ pub fn closest_solution(
 ) -> Result<Vec<f64>, IkError> {
     arm.angles(near)?;
     match closest_closed_form(arm, tool, goal, near) {
-        Err(IkError::NotThisFamily(_)) => numeric::closest(arm, tool, goal, near),
+        Err(IkError::NotThisFamily(_)) => multistart::closest(arm, tool, goal, near),
         answer => answer,
     }
 }
@@ -411,7 +415,7 @@ fn closest_closed_form(
             near,
             turn_rad: turn,
         };
-        closed_form::solve(arm, tool, goal, Some(preferred), |joints, _, singular| {
+        branches::solve(arm, tool, goal, Some(preferred), |joints, _, singular| {
             is_free |= singular;
             let mut q = [0.0; MAX_JOINTS];
             q[..n].copy_from_slice(joints);

@@ -1,15 +1,16 @@
 //! Damped least squares for any arm.
 //!
-//! Five task rows: the three of the tool point (metres) and the two of the rotation that turns
-//! the tool's axis onto the goal's (radians), measured in the plane square to the tool's axis.
+//! Task rows for a goal of point and axis: the three of the tool point (metres) and the two of the
+//! rotation that turns the tool's axis onto the goal's (radians), measured in the plane square to
+//! the tool's axis. For a whole pose: the three of the point and the three of the rotation vector.
 //! Step `dq = J^T (J J^T + lambda I)^-1 e` with Levenberg's damping: smaller after a step that
 //! helps, larger after one that does not. Joints that a step would push through a limit are held
 //! there and the step is computed again without them.
 
-use super::{AxisGoal, Constraint, IkError, LimitViolation, is_usable, normalise, travel_time};
-use crate::arm::{Arm, Frames, LIMIT_TOLERANCE_RAD, MAX_JOINTS};
+use super::{AxisGoal, Constraint, IkError, is_usable, normalise};
+use crate::arm::{Arm, Frames, MAX_JOINTS};
 use crate::tool::Tool;
-use nalgebra::{SMatrix, SVector, Vector3};
+use nalgebra::{Isometry3, Matrix3, Rotation3, SMatrix, SVector, Unit, UnitQuaternion, Vector3};
 use rover_geometry::tangent_basis;
 
 /// How [`solve_numeric`] works.
@@ -39,6 +40,35 @@ impl Default for NumericOptions {
     }
 }
 
+/// Where a frame of the last link shall be: all six constraints, for arms of six or seven joints.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PoseGoal {
+    /// The frame, fixed to the last link.
+    pub link_from_tool: Isometry3<f64>,
+    /// Where it shall be, arm base frame.
+    pub base_from_tool: Isometry3<f64>,
+}
+
+/// The direction that a goal asks for.
+#[derive(Clone, Copy)]
+enum Aim {
+    /// One axis of the last link, and where it shall point.
+    Axis {
+        in_link: Vector3<f64>,
+        wanted: Unit<Vector3<f64>>,
+    },
+    /// The whole rotation of the last link.
+    Rotation { base_from_link: UnitQuaternion<f64> },
+}
+
+/// A goal as the descent sees it.
+#[derive(Clone, Copy)]
+struct Task {
+    tip_in_link: Vector3<f64>,
+    point: Vector3<f64>,
+    aim: Aim,
+}
+
 /// Where a descent ended.
 struct End {
     q: [f64; MAX_JOINTS],
@@ -47,10 +77,10 @@ struct End {
     iterations: usize,
 }
 
-type Jacobian = SMatrix<f64, 5, MAX_JOINTS>;
+type Jacobian = SMatrix<f64, 6, MAX_JOINTS>;
 
 struct State {
-    error: SVector<f64, 5>,
+    error: SVector<f64, 6>,
     jacobian: Jacobian,
     position_error_m: f64,
     axis_error_rad: f64,
@@ -58,8 +88,7 @@ struct State {
 
 struct Descent<'a> {
     arm: &'a Arm,
-    tool: &'a Tool,
-    goal: &'a AxisGoal,
+    task: Task,
     /// Weight of a metre against a radian.
     position_weight: f64,
     options: &'a NumericOptions,
@@ -83,26 +112,35 @@ impl Descent<'_> {
     fn state(&self, q: &[f64]) -> Option<State> {
         let frames: Frames = self.arm.frames(q).ok()?;
         let n = frames.count;
-        let axis = frames.rotate(&self.tool.axis_in_link);
-        let tip = frames.origin[n] + frames.rotate(&self.tool.tip_in_link);
-        let (first, second) = tangent_basis(&nalgebra::Unit::new_normalize(axis));
-        let miss = self.goal.point - tip;
-        let turn = turn_between(&axis, &self.goal.axis, &first);
+        let tip = frames.origin[n] + frames.rotate(&self.task.tip_in_link);
+        let miss = self.task.point - tip;
+        // The rotation that is left, and the directions along which it is measured.
+        let (turn, rows) = match &self.task.aim {
+            Aim::Axis { in_link, wanted } => {
+                let axis = frames.rotate(in_link);
+                let (first, second) = tangent_basis(&Unit::new_normalize(axis));
+                let turn = turn_between(&axis, wanted, &first);
+                (turn, [first, second, Vector3::zeros()])
+            }
+            Aim::Rotation { base_from_link } => {
+                let here = Matrix3::from_columns(&[frames.x[n], frames.y(n), frames.z[n]]);
+                let here =
+                    UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(here));
+                let turn = (base_from_link * here.inverse()).scaled_axis();
+                (turn, [Vector3::x(), Vector3::y(), Vector3::z()])
+            }
+        };
         let k = self.position_weight;
-        let error = SVector::<f64, 5>::new(
-            k * miss.x,
-            k * miss.y,
-            k * miss.z,
-            turn.dot(&first),
-            turn.dot(&second),
-        );
+        let row = |point: Vector3<f64>, angle: &Vector3<f64>| {
+            let [a, b, c] = rows.map(|r| angle.dot(&r));
+            SVector::<f64, 6>::new(k * point.x, k * point.y, k * point.z, a, b, c)
+        };
+        let error = row(miss, &turn);
         let mut jacobian = Jacobian::zeros();
         for joint in 0..n {
             let z = &frames.z[joint];
-            let linear = z.cross(&(tip - frames.origin[joint])) * k;
-            let column =
-                SVector::<f64, 5>::new(linear.x, linear.y, linear.z, z.dot(&first), z.dot(&second));
-            jacobian.set_column(joint, &column);
+            let linear = z.cross(&(tip - frames.origin[joint]));
+            jacobian.set_column(joint, &row(linear, z));
         }
         let (position_error_m, axis_error_rad) = (miss.norm(), turn.norm());
         Some(State {
@@ -124,7 +162,7 @@ impl Descent<'_> {
         let mut step = SVector::zeros();
         for _ in 0..=q.len() {
             let mut normal = jacobian * jacobian.transpose();
-            for i in 0..5 {
+            for i in 0..6 {
                 normal[(i, i)] += damping;
             }
             let Some(factor) = normal.cholesky() else {
@@ -223,9 +261,54 @@ pub fn solve_numeric(
     if !is_usable(tool, goal) {
         return Err(IkError::NotFinite);
     }
+    let task = Task {
+        tip_in_link: tool.tip_in_link,
+        point: goal.point,
+        aim: Aim::Axis {
+            in_link: tool.axis_in_link.into_inner(),
+            wanted: goal.axis,
+        },
+    };
+    solve(arm, task, seed, options)
+}
+
+/// Joint angles (radians) that put a frame of the last link on a pose, found by descent from `seed`
+/// (radians). An arm of fewer than six joints meets only the poses that happen to suit it.
+///
+/// # Errors
+/// As [`solve_numeric`], the whole orientation in place of the axis.
+pub fn solve_pose(
+    arm: &Arm,
+    goal: &PoseGoal,
+    seed: &[f64],
+    options: &NumericOptions,
+) -> Result<Vec<f64>, IkError> {
+    arm.angles(seed)?;
+    let usable = |pose: &Isometry3<f64>| {
+        pose.translation.vector.norm_squared().is_finite()
+            && (pose.rotation.coords.norm_squared() - 1.0).abs() < 1e-9
+    };
+    if !usable(&goal.link_from_tool) || !usable(&goal.base_from_tool) {
+        return Err(IkError::NotFinite);
+    }
+    let task = Task {
+        tip_in_link: goal.link_from_tool.translation.vector,
+        point: goal.base_from_tool.translation.vector,
+        aim: Aim::Rotation {
+            base_from_link: goal.base_from_tool.rotation * goal.link_from_tool.rotation.inverse(),
+        },
+    };
+    solve(arm, task, seed, options)
+}
+
+fn solve(
+    arm: &Arm,
+    task: Task,
+    seed: &[f64],
+    options: &NumericOptions,
+) -> Result<Vec<f64>, IkError> {
     let n = arm.joint_count();
-    let lengths: f64 = arm.rows().iter().map(|r| r.a_m.hypot(r.d_m)).sum();
-    let by_m = goal.point.norm() - lengths - tool.tip_in_link.norm();
+    let by_m = task.point.norm() - arm.reach_m(task.tip_in_link.norm());
     if by_m > options.position_tolerance_m {
         return Err(IkError::OutOfReach {
             constraint: Constraint::TotalLength,
@@ -234,8 +317,7 @@ pub fn solve_numeric(
     }
     let descent = Descent {
         arm,
-        tool,
-        goal,
+        task,
         position_weight: 1.0,
         options,
     };
@@ -269,8 +351,7 @@ pub fn solve_numeric(
     // Insist on the point and see what is left of the axis.
     let insisting = Descent {
         arm,
-        tool,
-        goal,
+        task,
         position_weight: 1e4,
         options,
     };
@@ -286,70 +367,3 @@ pub fn solve_numeric(
         iterations: end.iterations,
     })
 }
-
-/// The nearest to `near` of the answers from `near` itself and, if that fails, from fixed seeds
-/// spread over the limits.
-pub(crate) fn closest(
-    arm: &Arm,
-    tool: &Tool,
-    goal: &AxisGoal,
-    near: &[f64],
-) -> Result<Vec<f64>, IkError> {
-    const SEEDS: u32 = 24;
-    let options = NumericOptions::default();
-    let first = match solve_numeric(arm, tool, goal, near, &options) {
-        Ok(q) => return Ok(q),
-        Err(error @ (IkError::OutOfReach { .. } | IkError::NotFinite | IkError::Arm(_))) => {
-            return Err(error);
-        }
-        Err(error) => error,
-    };
-    let mut best: Option<(f64, Vec<f64>)> = None;
-    let mut least: Option<LimitViolation> = None;
-    for index in 0..SEEDS {
-        // A Kronecker sequence: the golden-ratio-like generalisation fills the box evenly.
-        let seed: Vec<f64> = arm
-            .limits()
-            .iter()
-            .zip(1_u32..)
-            .map(|(l, joint)| {
-                let step = KRONECKER.powi(-i32::try_from(joint).unwrap_or(1));
-                let fraction = (0.5 + f64::from(index) * step).fract();
-                l.lower_rad + fraction * (l.upper_rad - l.lower_rad)
-            })
-            .collect();
-        match solve_numeric(arm, tool, goal, &seed, &options) {
-            Ok(q) => {
-                let time = travel_time(arm, &q, near);
-                if best.as_ref().is_none_or(|(t, _)| time < *t) {
-                    best = Some((time, q));
-                }
-            }
-            Err(IkError::JointLimit {
-                joint,
-                value_rad,
-                lower_rad,
-                upper_rad,
-            }) => {
-                let violation = LimitViolation {
-                    joint,
-                    value_rad,
-                    lower_rad,
-                    upper_rad,
-                };
-                if least.is_none_or(|l| violation.excess_rad() < l.excess_rad()) {
-                    least = Some(violation);
-                }
-            }
-            Err(_) => {}
-        }
-    }
-    match (best, least) {
-        (Some((_, q)), _) => Ok(q),
-        (None, Some(v)) if v.excess_rad() > LIMIT_TOLERANCE_RAD => Err(v.into()),
-        _ => Err(first),
-    }
-}
-
-/// The real root of `x^8 = x + 1`, whose powers are the steps of the sequence in 7 dimensions.
-const KRONECKER: f64 = 1.096_981_557_798_559_8;

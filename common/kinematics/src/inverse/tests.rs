@@ -3,7 +3,7 @@
 #![allow(clippy::approx_constant)]
 
 use super::*;
-use crate::arm::{DhRow, JointLimits};
+use crate::rows::{DhRow, JointLimits};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::f64::consts::{FRAC_PI_2, PI};

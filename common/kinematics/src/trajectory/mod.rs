@@ -4,7 +4,8 @@ mod profile;
 mod spline;
 mod timing;
 
-use crate::arm::{Arm, ArmError, LIMIT_TOLERANCE_RAD};
+use crate::arm::{Arm, LIMIT_TOLERANCE_RAD};
+use crate::rows::ArmError;
 use serde::{Deserialize, Serialize};
 pub use timing::{TimingOptions, through, through_with};
 

@@ -3,7 +3,7 @@
 #![allow(clippy::approx_constant)]
 
 use super::*;
-use crate::arm::{DhRow, JointLimits};
+use crate::rows::{DhRow, JointLimits};
 use crate::{AxisGoal, Tool, closest_solution};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
