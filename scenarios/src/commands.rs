@@ -1,5 +1,6 @@
 //! The verbs of the command line, one file each.
 
+pub mod camera;
 pub mod doctor;
 pub mod inspect;
 pub mod run;
