@@ -42,10 +42,9 @@ pub struct Cahvore {
 /// A point on its way to the image.
 struct Seen {
     sight: Sight,
-    /// Component of the point's offset along O and length of that across it, metres.
-    along_m: f64,
-    across_m: f64,
+    /// The part of the point's offset from C across O, and its length, metres.
     across: Vector3<f64>,
+    across_m: f64,
     chi: f64,
     chi_slope: f64,
     mu: f64,
@@ -108,9 +107,8 @@ impl Cahvore {
         }
         Ok(Seen {
             sight,
-            along_m,
-            across_m,
             across,
+            across_m,
             chi,
             chi_slope,
             mu,
@@ -121,12 +119,7 @@ impl Cahvore {
 
     pub(crate) fn project(&self, point: &Vector3<f64>) -> Result<Vector2<f64>, CameraError> {
         let seen = self.see(point)?;
-        finite_pixel(linear::image(
-            &self.h,
-            &self.v,
-            &seen.offset,
-            seen.range_m,
-        ))
+        finite_pixel(linear::image(&self.h, &self.v, &seen.offset, seen.range_m))
     }
 
     pub(crate) fn project_with_jacobian(
@@ -134,14 +127,8 @@ impl Cahvore {
         point: &Vector3<f64>,
     ) -> Result<Projection, CameraError> {
         let seen = self.see(point)?;
-        let pixel_px = finite_pixel(linear::image(
-            &self.h,
-            &self.v,
-            &seen.offset,
-            seen.range_m,
-        ))?;
-        let outer =
-            linear::image_jacobian(&self.a, &self.h, &self.v, &pixel_px, seen.range_m);
+        let pixel_px = finite_pixel(linear::image(&self.h, &self.v, &seen.offset, seen.range_m))?;
+        let outer = linear::image_jacobian(&self.a, &self.h, &self.v, &pixel_px, seen.range_m);
         let out_of_o = outer * self.o;
         let stretch = 1.0 + seen.mu;
         // The part of d(offset)/dP that only turns: (1 + mu) (I - O O^T).
@@ -161,7 +148,6 @@ impl Cahvore {
         } else {
             turning + out_of_o * self.o.transpose()
         };
-        debug_assert!(seen.along_m.is_finite());
         Ok(Projection {
             pixel_px,
             jacobian,
@@ -198,20 +184,19 @@ impl Cahvore {
         }
         let across = across / along;
         let tangent = across.norm();
-        let ratio =
-            Radial(&self.r)
-                .undistorted_ratio(tangent * tangent)
-                .map_err(|reason| match reason {
-                    RadialError::Outside => outside(),
-                    RadialError::NoConvergence {
-                        iterations,
-                        last_step,
-                    } => CameraError::NoConvergence {
-                        pixel_px: *pixel_px,
-                        iterations,
-                        last_step,
-                    },
-                })?;
+        let ratio = Radial(&self.r)
+            .undistorted_ratio(tangent * tangent)
+            .map_err(|reason| match reason {
+                RadialError::Outside => outside(),
+                RadialError::NoConvergence {
+                    iterations,
+                    last_step,
+                } => CameraError::NoConvergence {
+                    pixel_px: *pixel_px,
+                    iterations,
+                    last_step,
+                },
+            })?;
         let chi = tangent * ratio;
         let theta = self
             .pupil()
@@ -256,7 +241,7 @@ impl Cahvore {
         let dtangent_dchi = 1.0 + self.r.x + tau * (3.0 * r1 + 5.0 * r2 * tau);
         let dtheta_dtangent = 1.0 / (self.pupil().chi(bent.theta).1 * dtangent_dchi);
         let shift_slope = self.pupil().shift(bent.theta).1;
-        let (direction_m, origin_m) = if bent.tangent <= ON_AXIS {
+        let (radial, origin_slope) = if bent.tangent <= ON_AXIS {
             (None, Vector3::zeros())
         } else {
             (
@@ -273,7 +258,7 @@ impl Cahvore {
             // Derivative of across = (unit - (unit.O) O) / (unit.O).
             let d_along = d.dot(&self.o);
             let d_across = (d - self.o * d_along - bent.across * d_along) / along;
-            let (d_direction, d_tangent) = match direction_m {
+            let (d_direction, d_tangent) = match radial {
                 None => (d_across / (1.0 + self.r.x), 0.0),
                 Some(n) => {
                     let d_tangent = n.dot(&d_across);
@@ -287,7 +272,7 @@ impl Cahvore {
             };
             let u = ray.direction.as_ref();
             let turned = (d_direction - u * u.dot(&d_direction)) / norm;
-            (turned, origin_m * d_tangent)
+            (turned, origin_slope * d_tangent)
         };
         let (first, second) = (
             column(d_unit.column(0).into_owned()),

@@ -71,7 +71,7 @@ pub struct Projection {
     /// Derivative of the pixel with respect to the point, px/m: rows u, v; columns x, y, z of the
     /// model's frame.
     pub jacobian: Matrix2x3<f64>,
-    /// Range along A: of the point for CAHV, of the point after distortion for CAHVOR (the
+    /// Range along A: of the point for CAHV, of the point after distortion for the others (the
     /// denominator of the projection, as the JPL library reports it), metres.
     pub range_m: f64,
 }
@@ -236,7 +236,8 @@ impl Camera {
     /// [`Self::project`]. Published models carry six digits; if their O is longer or shorter than
     /// 1 by `e`, a round trip errs by a few `e |mu|` focal lengths: 1e-10 to 1e-8 px at the
     /// corners for most, 5e-6 px for the worst flight model in our tests (`e` = 4e-4).
-    /// [`Self::with_unit_axes`] removes it.
+    /// [`Self::with_unit_axes`] removes it. A CAHVORE ray is measured from O as a whole, so that
+    /// its round trip errs by about `e` focal lengths.
     ///
     /// # Errors
     /// `OutsideField` if the pixel is further out than the distortion is one-to-one,

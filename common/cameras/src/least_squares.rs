@@ -61,8 +61,8 @@ pub(crate) fn minimise<P: Problem>(
             .and_then(|step| {
                 let moved = problem.moved(&state, &step);
                 let cost = problem.cost(&moved).filter(|c| c.is_finite())?;
-                let model = -(normal.gradient.dot(&step)
-                    + 0.5 * step.dot(&(&normal.hessian * &step)));
+                let model =
+                    -(normal.gradient.dot(&step) + 0.5 * step.dot(&(&normal.hessian * &step)));
                 Some((moved, cost, model))
             });
         let end = |settled| Minimum {

@@ -92,10 +92,10 @@
 // `!(x > limit)` is meant: a NaN has to take the branch of the error.
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
-pub mod calibration;
 mod cahv;
 mod cahvor;
 mod cahvore;
+pub mod calibration;
 mod camera;
 mod error;
 pub mod formats;

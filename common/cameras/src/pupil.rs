@@ -155,8 +155,7 @@ impl Pupil<'_> {
             let (e, slope) = self.polynomial(theta);
             let excess = theta - sine;
             let value = along_m * sine - across_m * cosine - excess * e;
-            let slope_m =
-                along_m * cosine + across_m * sine - (1.0 - cosine) * e - excess * slope;
+            let slope_m = along_m * cosine + across_m * sine - (1.0 - cosine) * e - excess * slope;
             (value, slope_m, sine, cosine)
         };
         // The root is kept between an angle with g <= 0 and one with g > 0 as soon as both are

@@ -261,15 +261,16 @@ impl StereoPair {
             );
             (dp + dv * t + u * ds + v * dt) * 0.5
         };
-        let columns = |d: &RayJacobians, by: &dyn Fn(Vector3<f64>, Vector3<f64>) -> Vector3<f64>| {
-            let column = |i: usize| {
-                by(
-                    d.direction.column(i).into_owned(),
-                    d.origin.column(i).into_owned(),
-                )
+        let columns =
+            |d: &RayJacobians, by: &dyn Fn(Vector3<f64>, Vector3<f64>) -> Vector3<f64>| {
+                let column = |i: usize| {
+                    by(
+                        d.direction.column(i).into_owned(),
+                        d.origin.column(i).into_owned(),
+                    )
+                };
+                Matrix3x2::from_columns(&[column(0), column(1)])
             };
-            Matrix3x2::from_columns(&[column(0), column(1)])
-        };
         let jacobians = [columns(&left_by, &by_left), columns(&right_by, &by_right)];
         Ok((found, jacobians))
     }

@@ -11,11 +11,7 @@ impl Camera {
     ///
     /// # Errors
     /// `InvalidModel` if the part is empty or reaches beyond the image.
-    pub fn subframe(
-        &self,
-        origin_px: [u32; 2],
-        size_px: [u32; 2],
-    ) -> Result<Camera, CameraError> {
+    pub fn subframe(&self, origin_px: [u32; 2], size_px: [u32; 2]) -> Result<Camera, CameraError> {
         let ends = [0, 1].map(|i| u64::from(origin_px[i]) + u64::from(size_px[i]));
         if size_px.contains(&0)
             || ends[0] > u64::from(self.width_px)

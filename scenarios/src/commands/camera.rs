@@ -1,5 +1,6 @@
 //! `rover camera`: camera models on a person's own files.
 
+mod calibrate;
 mod convert;
 mod files;
 mod info;
@@ -8,7 +9,7 @@ mod points;
 use super::{CommandError, Exit};
 use clap::Subcommand;
 
-/// Camera models: what they say, projection, rays, triangulation, conversion
+/// Camera models: what they say, projection, rays, triangulation, conversion, calibration
 ///
 /// A model file is CAHV text, TOML, ROS CameraInfo YAML, OpenCV YAML or a Kalibr chain (of which
 /// FILE#1 is the second camera); `-` is standard input.
@@ -25,6 +26,7 @@ enum Verb {
     Ray(points::RayArgs),
     Triangulate(points::TriangulateArgs),
     Convert(convert::ConvertArgs),
+    Calibrate(calibrate::CalibrateArgs),
 }
 
 /// Runs the command.
@@ -38,6 +40,7 @@ pub fn run(args: CameraArgs) -> Result<Exit, CommandError> {
         Verb::Ray(args) => points::ray(&args),
         Verb::Triangulate(args) => points::triangulate(&args),
         Verb::Convert(args) => convert::run(&args),
+        Verb::Calibrate(args) => calibrate::run(&args),
     }?;
     Ok(Exit::Done)
 }

@@ -236,7 +236,9 @@ impl Problem for Adjustment<'_> {
         let mut cost = 0.0;
         self.each(|view, camera, point| {
             if self.used[view][camera][point] {
-                cost += self.robust(&self.error(rig, &models, [view, camera, point])?).1;
+                cost += self
+                    .robust(&self.error(rig, &models, [view, camera, point])?)
+                    .1;
             }
             Some(())
         })?;
@@ -262,7 +264,9 @@ impl Problem for Adjustment<'_> {
                     p[i] += sign * difference_step(i);
                     own_camera(rig.kind, &p)
                 };
-                (0..inner.len()).map(|i| [at(i, 1.0), at(i, -1.0)]).collect()
+                (0..inner.len())
+                    .map(|i| [at(i, 1.0), at(i, -1.0)])
+                    .collect()
             })
             .collect();
         let scale = 1.0 / (self.sigma_px * self.sigma_px);

@@ -125,7 +125,11 @@ impl Rig {
             if camera > 0 {
                 names.extend(POSE.map(|name| format!("{side}.{name}")));
             }
-            names.extend(INNER[..inner.len()].iter().map(|name| format!("{side}.{name}")));
+            names.extend(
+                INNER[..inner.len()]
+                    .iter()
+                    .map(|name| format!("{side}.{name}")),
+            );
         }
         names
     }
@@ -156,6 +160,11 @@ impl Rig {
                 _ => camera,
             }
         };
-        self.inner.iter().zip(sizes_px).enumerate().map(of).collect()
+        self.inner
+            .iter()
+            .zip(sizes_px)
+            .enumerate()
+            .map(of)
+            .collect()
     }
 }

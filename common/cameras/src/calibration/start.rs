@@ -57,7 +57,10 @@ pub(super) fn rig(
         .collect::<Result<_, _>>()?;
     Ok(Rig {
         kind: rules.model,
-        inner: alone.into_iter().map(|(rig, _)| rig.inner[0].clone()).collect(),
+        inner: alone
+            .into_iter()
+            .map(|(rig, _)| rig.inner[0].clone())
+            .collect(),
         second_from_first,
         camera_from_board,
     })
@@ -164,8 +167,7 @@ fn pose(model: &CameraModel, points: &[BoardPoint]) -> Option<Isometry3<f64>> {
     let mut h = homography(&pairs)?;
     let scale = 2.0 / (h.column(0).norm() + h.column(1).norm());
     h *= if h[(2, 2)] < 0.0 { -scale } else { scale };
-    let (x, y): (Vector3<f64>, Vector3<f64>) =
-        (h.column(0).into_owned(), h.column(1).into_owned());
+    let (x, y): (Vector3<f64>, Vector3<f64>) = (h.column(0).into_owned(), h.column(1).into_owned());
     let raw = Matrix3::from_columns(&[x, y, x.cross(&y)]);
     let svd = raw.svd(true, true);
     let rotation = svd.u? * svd.v_t?;

@@ -82,9 +82,7 @@ pub enum ConversionError {
         off_axis_deg: f64,
     },
     /// The camera has rays only in a small part of its image.
-    #[error(
-        "the model has rays in only {covered} of its image, expected at least {MIN_COVERED}"
-    )]
+    #[error("the model has rays in only {covered} of its image, expected at least {MIN_COVERED}")]
     NotCovered {
         /// Share of pixels with a ray.
         covered: f64,
@@ -118,9 +116,8 @@ fn samples(
     let mut covered = 0_u32;
     for j in 0..grid[1] {
         for i in 0..grid[0] {
-            let at = |k: u32, n: u32, size: u32| {
-                f64::from(k) / f64::from(n - 1) * f64::from(size) - 0.5
-            };
+            let at =
+                |k: u32, n: u32, size: u32| f64::from(k) / f64::from(n - 1) * f64::from(size) - 0.5;
             let pixel = Vector2::new(at(i, grid[0], size_px[0]), at(j, grid[1], size_px[1]));
             if let Ok(ray) = ray(&pixel) {
                 covered += 1;
@@ -198,8 +195,8 @@ impl LensCamera {
                 covered: check.covered,
             });
         }
-        let [first, second] = self.starts();
-        let start = self.with_model(&first);
+        let starts = self.starts();
+        let start = self.with_model(&starts[0]);
         let rate = |camera: &Camera| worst_px(&check, |p| camera.project(p));
         if let Some(worst_px) = rate(&start)
             && worst_px <= EXACT_PX
@@ -214,7 +211,7 @@ impl LensCamera {
         }
         let train = take(FIT_GRID);
         let mut best: Option<(f64, Camera)> = None;
-        for model in [first, second] {
+        for model in starts {
             let found = self.fit_cahv(&train, &model);
             if let Some(camera) = found
                 && let Some(worst) = rate(&camera)
@@ -247,17 +244,32 @@ impl LensCamera {
     }
 
     /// The distortion terms of the CAHV family that come nearest, and others to try.
-    fn starts(&self) -> [Terms; 2] {
+    fn starts(&self) -> Vec<Terms> {
         match self.lens {
-            Lens::Polynomial { k, .. } => {
+            Lens::Polynomial { k, p } => {
                 let r = [0.0, k[0] - k[3], k[1] - k[4]];
                 let plain = self.lens == Lens::NONE;
-                [
+                // To first order a tilt of O by -p / k1 makes the tangential terms.
+                let tilt = |p: f64| {
+                    let tilt = -p / r[1];
+                    if tilt.is_finite() {
+                        tilt.clamp(-0.05, 0.05)
+                    } else {
+                        0.0
+                    }
+                };
+                vec![
                     Terms {
                         axis: [0.0; 2],
                         r,
                         linearity: None,
                         distorted: !plain,
+                    },
+                    Terms {
+                        axis: [tilt(p[1]), tilt(p[0])],
+                        r,
+                        linearity: None,
+                        distorted: true,
                     },
                     Terms {
                         axis: [0.0; 2],
@@ -275,7 +287,7 @@ impl LensCamera {
                     linearity: Some(linearity),
                     distorted: true,
                 };
-                [terms(0.0), terms(0.3)]
+                vec![terms(0.0), terms(0.3)]
             }
         }
     }
@@ -302,10 +314,7 @@ impl LensCamera {
         steps[3..7].fill(1e-3);
         let build = |x: &DVector<f64>| {
             let x = x.as_slice();
-            let pose = nudged(
-                &self.frame_from_camera,
-                &[x[0], x[1], x[2], 0.0, 0.0, 0.0],
-            );
+            let pose = nudged(&self.frame_from_camera, &[x[0], x[1], x[2], 0.0, 0.0, 0.0]);
             let moved = Terms {
                 axis: [x[7], x[8]],
                 r: [0.0, x[9], x[10]],
@@ -447,10 +456,7 @@ impl Terms {
 fn start_of(camera: &Camera, family: Family) -> LensCamera {
     let terms = camera.intrinsics();
     let rotation = UnitQuaternion::from_rotation_matrix(&terms.camera_from_model.inverse());
-    let r = camera
-        .model
-        .lens()
-        .map_or(Vector3::zeros(), |[_, r]| *r);
+    let r = camera.model.lens().map_or(Vector3::zeros(), |[_, r]| *r);
     let stretch = 1.0 + r.x;
     let (r1, r2) = (r.y / stretch, r.z / stretch);
     // tan(L t) / L = t (1 + L^2 t^2 / 3 + 2 L^4 t^4 / 15 + ...), sin(L t) / L = t (1 - ...).

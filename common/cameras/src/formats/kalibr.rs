@@ -65,7 +65,11 @@ pub fn read(text: &str) -> Result<Vec<LensCamera>, FormatError> {
             (None, 0) => Isometry3::identity(),
             (Some(rows), 1..) => previous * pose(&at("T_cn_cnm1"), rows)?.inverse(),
             (Some(_), 0) => {
-                return Err(wrong(&at("T_cn_cnm1"), "a pose", "none in the first camera"));
+                return Err(wrong(
+                    &at("T_cn_cnm1"),
+                    "a pose",
+                    "none in the first camera",
+                ));
             }
             (None, _) => return Err(wrong(&at("T_cn_cnm1"), "nothing", "a 4 x 4 pose")),
         };
@@ -169,9 +173,7 @@ pub fn write(cameras: &[LensCamera]) -> Result<String, FormatError> {
         camera.validate()?;
         let (model, d) = match &camera.lens {
             Lens::Equidistant { k } => ("equidistant", *k),
-            Lens::Polynomial { k, p } if k[2..] == [0.0; 4] => {
-                ("radtan", [k[0], k[1], p[0], p[1]])
-            }
+            Lens::Polynomial { k, p } if k[2..] == [0.0; 4] => ("radtan", [k[0], k[1], p[0], p[1]]),
             Lens::Polynomial { k, .. } => {
                 let field = format!("cam{n}.distortion_coeffs");
                 return Err(wrong(&field, format_args!("{k:?}"), "k1 and k2 only"));
@@ -181,8 +183,8 @@ pub fn write(cameras: &[LensCamera]) -> Result<String, FormatError> {
         // Writing to a String cannot fail.
         let _ = writeln!(text, "cam{n}:");
         if let Some(before) = n.checked_sub(1).and_then(|m| cameras.get(m)) {
-            let step = (camera.frame_from_camera.inverse() * before.frame_from_camera)
-                .to_homogeneous();
+            let step =
+                (camera.frame_from_camera.inverse() * before.frame_from_camera).to_homogeneous();
             text.push_str("  T_cn_cnm1:\n");
             for row in step.row_iter() {
                 let row: Vec<f64> = row.iter().copied().collect();

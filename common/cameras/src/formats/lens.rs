@@ -168,13 +168,13 @@ impl LensCamera {
         if !(image.x + image.y).is_finite() {
             return Err(CameraError::NotFinite);
         }
-        let direction =
-            self.lens
-                .undistorted(&image)
-                .ok_or_else(|| CameraError::OutsideField {
-                    off_axis_deg: image.norm().atan().to_degrees(),
-                    limit_deg: self.limit_deg(),
-                })?;
+        let direction = self
+            .lens
+            .undistorted(&image)
+            .ok_or_else(|| CameraError::OutsideField {
+                off_axis_deg: image.norm().atan().to_degrees(),
+                limit_deg: self.limit_deg(),
+            })?;
         Ok(Ray {
             origin: self.frame_from_camera.translation.vector,
             direction: Unit::new_normalize(self.frame_from_camera.rotation * direction),
@@ -247,8 +247,7 @@ fn polynomial(k: &[f64; 6], p: &[f64; 2], at: &Vector2<f64>) -> (Vector2<f64>, M
 fn equidistant(k: &[f64; 4], theta: f64) -> (f64, f64) {
     let t2 = theta * theta;
     let value = theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))));
-    let slope =
-        1.0 + t2 * (3.0 * k[0] + t2 * (5.0 * k[1] + t2 * (7.0 * k[2] + t2 * 9.0 * k[3])));
+    let slope = 1.0 + t2 * (3.0 * k[0] + t2 * (5.0 * k[1] + t2 * (7.0 * k[2] + t2 * 9.0 * k[3])));
     (value, slope)
 }
 

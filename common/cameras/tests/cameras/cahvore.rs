@@ -53,7 +53,10 @@ fn an_ideal_fisheye_is_linear_in_the_angle_and_sees_beyond_a_right_angle() {
         let angle = degrees.to_radians();
         let point = Vector3::new(angle.sin(), 0.0, angle.cos()) * 2.0;
         let pixel = camera.project(&point).unwrap();
-        assert!((pixel.x - (319.5 + 300.0 * angle)).abs() < 1e-9, "{degrees}: {pixel}");
+        assert!(
+            (pixel.x - (319.5 + 300.0 * angle)).abs() < 1e-9,
+            "{degrees}: {pixel}"
+        );
         let ray = camera.ray(&pixel).unwrap();
         assert!((ray.at(2.0) - point).amax() < 1e-11, "{degrees}");
     }
@@ -71,7 +74,12 @@ fn every_linearity_is_continuous_through_zero_and_round_trips() {
     assert!((near(-1e-5) - near(0.0)).amax() < 1e-6);
     for linearity in [-1.0, -0.4, 0.0, 0.37, 1.0] {
         let camera = model(linearity, [0.0, -0.02, 0.001], e);
-        for (u, v) in [(319.5, 239.5), (319.6, 239.4), (100.0, 400.0), (500.0, 20.0)] {
+        for (u, v) in [
+            (319.5, 239.5),
+            (319.6, 239.4),
+            (100.0, 400.0),
+            (500.0, 20.0),
+        ] {
             let pixel = Vector2::new(u, v);
             let ray = camera.ray(&pixel).unwrap();
             let back = camera.project(&ray.at(0.3)).unwrap();
@@ -84,9 +92,15 @@ fn every_linearity_is_continuous_through_zero_and_round_trips() {
 fn points_without_a_single_ray_are_refused_with_the_reason() {
     let perspective = model(1.0, [0.0; 3], [0.001, 0.0, 0.0]);
     let refused = perspective.project(&Vector3::new(0.1, 0.0, -1.0));
-    assert!(matches!(refused, Err(CameraError::OutsideField { .. })), "{refused:?}");
+    assert!(
+        matches!(refused, Err(CameraError::OutsideField { .. })),
+        "{refused:?}"
+    );
     let at_pupil = perspective.project(&Vector3::zeros());
-    assert!(matches!(at_pupil, Err(CameraError::NearPupil { .. })), "{at_pupil:?}");
+    assert!(
+        matches!(at_pupil, Err(CameraError::NearPupil { .. })),
+        "{at_pupil:?}"
+    );
     let wide = model(0.0, [0.0; 3], [0.05, 0.0, 0.0]);
     let inside = wide.project(&Vector3::new(0.01, 0.0, 0.005));
     assert!(inside.is_err(), "{inside:?}");
@@ -108,7 +122,10 @@ fn pixels_beyond_the_field_are_refused_with_its_limit() {
     }
     let pixel = Vector2::new(319.5 + 300.0, 239.5);
     let refused = folding.ray(&pixel);
-    assert!(matches!(refused, Err(CameraError::OutsideField { .. })), "{refused:?}");
+    assert!(
+        matches!(refused, Err(CameraError::OutsideField { .. })),
+        "{refused:?}"
+    );
     // A sine projection ends where the sine does.
     let sine = model(-1.0, [0.0; 3], [0.0; 3]);
     assert!(sine.ray(&Vector2::new(319.5 + 299.0, 239.5)).is_ok());
@@ -119,16 +136,26 @@ fn pixels_beyond_the_field_are_refused_with_its_limit() {
 fn a_linearity_or_pupil_that_describes_no_lens_is_refused() {
     for (linearity, e0) in [(1.5, 0.0), (f64::NAN, 0.0), (0.3, f64::INFINITY)] {
         let camera = model(linearity, [0.0; 3], [e0, 0.0, 0.0]);
-        assert!(matches!(camera.validate(), Err(CameraError::InvalidModel { .. })));
+        assert!(matches!(
+            camera.validate(),
+            Err(CameraError::InvalidModel { .. })
+        ));
     }
 }
 
 #[test]
 fn points_outside_the_image_are_told_from_those_inside() {
     let camera = model(1.0, [0.0; 3], [0.0; 3]);
-    assert!(camera.project_into_image(&Vector3::new(0.1, 0.0, 1.0), 0.0).is_ok());
+    assert!(
+        camera
+            .project_into_image(&Vector3::new(0.1, 0.0, 1.0), 0.0)
+            .is_ok()
+    );
     let outside = camera.project_into_image(&Vector3::new(2.0, 0.0, 1.0), 0.0);
-    assert!(matches!(outside, Err(CameraError::OutsideImage { .. })), "{outside:?}");
+    assert!(
+        matches!(outside, Err(CameraError::OutsideImage { .. })),
+        "{outside:?}"
+    );
 }
 
 /// The moving origin enters the triangulated point's derivative.
@@ -142,8 +169,13 @@ fn triangulation_derivatives_hold_for_moving_pupils() {
     let [left, right] = [hazcams[0].clone(), hazcams[1].clone()];
     let pair = StereoPair { left, right };
     let point = Vector3::new(2.0, 0.15, 0.1);
-    let pixels = [pair.left.project(&point).unwrap(), pair.right.project(&point).unwrap()];
-    let (found, jacobians) = pair.triangulate_with_jacobian(&pixels[0], &pixels[1]).unwrap();
+    let pixels = [
+        pair.left.project(&point).unwrap(),
+        pair.right.project(&point).unwrap(),
+    ];
+    let (found, jacobians) = pair
+        .triangulate_with_jacobian(&pixels[0], &pixels[1])
+        .unwrap();
     assert!((found.point - point).amax() < 1e-9);
     for side in 0..2 {
         for axis in 0..2 {

@@ -43,14 +43,9 @@ fn camera(kind: ModelKind, p: &[f64]) -> Camera {
     let r = [0.0, at(6), at(7)];
     match kind {
         ModelKind::Cahv => plain,
-        ModelKind::Cahvor => Camera::pinhole_distorted(
-            &own,
-            [at(0), at(1)],
-            [at(2), at(3)],
-            SIZE_PX,
-            &axis,
-            r,
-        ),
+        ModelKind::Cahvor => {
+            Camera::pinhole_distorted(&own, [at(0), at(1)], [at(2), at(3)], SIZE_PX, &axis, r)
+        }
         ModelKind::Cahvore { linearity } => {
             let [c, a, h, v] = plain.model.cahv().map(|x| *x);
             let model = CameraModel::Cahvore(Cahvore {
@@ -109,8 +104,7 @@ fn views(truth: &Truth, n: usize, noise_px: f64, seed: u64, tilt_rad: f64) -> Ve
                 noise.uniform(-0.06, 0.06),
                 noise.uniform(0.28, 0.5),
             );
-            let pose =
-                Isometry3::from_parts(Translation3::from(shift), UnitQuaternion::new(turn));
+            let pose = Isometry3::from_parts(Translation3::from(shift), UnitQuaternion::new(turn));
             let mut seen = |camera: &Camera| -> Vec<BoardPoint> {
                 let mut points = Vec::new();
                 for i in 0..54 {
@@ -120,11 +114,14 @@ fn views(truth: &Truth, n: usize, noise_px: f64, seed: u64, tilt_rad: f64) -> Ve
                     let Ok(pixel) = camera.project_into_image(&point.coords, 1.0) else {
                         continue;
                     };
-                    let pixel_px =
-                        pixel + Vector2::new(noise.normal(), noise.normal()) * noise_px;
+                    let pixel_px = pixel + Vector2::new(noise.normal(), noise.normal()) * noise_px;
                     points.push(BoardPoint { board_m, pixel_px });
                 }
-                if points.len() < 12 { Vec::new() } else { points }
+                if points.len() < 12 {
+                    Vec::new()
+                } else {
+                    points
+                }
             };
             truth.cameras.iter().map(&mut seen).collect()
         })
@@ -162,7 +159,10 @@ fn inside_three_sigma(truth: &Truth, seeds: std::ops::Range<u64>) {
     }
     let inside = all.iter().filter(|x| x.abs() < 3.0).count() as f64 / all.len() as f64;
     let square = all.iter().map(|x| x * x).sum::<f64>() / all.len() as f64;
-    println!("{:?}: {inside} within 3 sigma, mean square pull {square}", truth.kind);
+    println!(
+        "{:?}: {inside} within 3 sigma, mean square pull {square}",
+        truth.kind
+    );
     assert!(inside >= 0.95, "{inside}");
     assert!((0.4..1.7).contains(&square), "{square}");
 }
@@ -269,8 +269,15 @@ fn corners_that_are_wrong_are_rejected_and_do_not_matter() {
         }
     }
     let found = calibrate(&[SIZE_PX; 2], &views, &rules(pair.kind)).unwrap();
-    assert!((spoilt..spoilt + 8).contains(&found.rejected), "{spoilt} {}", found.rejected);
-    let inside = pulls(&found, &pair).iter().filter(|x| x.abs() < 3.5).count();
+    assert!(
+        (spoilt..spoilt + 8).contains(&found.rejected),
+        "{spoilt} {}",
+        found.rejected
+    );
+    let inside = pulls(&found, &pair)
+        .iter()
+        .filter(|x| x.abs() < 3.5)
+        .count();
     assert!(inside >= 21, "{inside} of 22");
     assert!((0.09..0.11).contains(&found.sigma_px), "{}", found.sigma_px);
 }

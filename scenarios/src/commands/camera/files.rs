@@ -5,8 +5,8 @@ use anyhow::Context;
 use rover_cameras::{
     Camera, CameraModel,
     formats::{
-        Conversion, ConversionRules, Family, FormatError, LensCamera, MAX_BYTES, ModelFile,
-        kalibr, opencv, read_text, read_toml, ros, write_text, write_toml,
+        Conversion, ConversionRules, Family, FormatError, LensCamera, MAX_BYTES, ModelFile, kalibr,
+        opencv, read_text, read_toml, ros, write_text, write_toml,
     },
 };
 use std::{
@@ -135,9 +135,9 @@ fn member(path: &Path) -> Result<(std::path::PathBuf, usize), CommandError> {
     let whole = path.to_string_lossy();
     match whole.rsplit_once('#') {
         Some((file, number)) if !path.exists() => {
-            let n = number.parse().map_err(|_| {
-                bad(&whole, &"expected a camera's number after #, as in FILE#1")
-            })?;
+            let n = number
+                .parse()
+                .map_err(|_| bad(&whole, &"expected a camera's number after #, as in FILE#1"))?;
             Ok((file.into(), n))
         }
         _ => Ok((path.into(), 0)),
@@ -186,7 +186,10 @@ fn format_of(path: &Path, text: &str) -> Format {
     if kalibr::is_kalibr(text) {
         return Format::Kalibr;
     }
-    let has = |start: &str| text.lines().any(|line| line.trim_start().starts_with(start));
+    let has = |start: &str| {
+        text.lines()
+            .any(|line| line.trim_start().starts_with(start))
+    };
     if has("[model") {
         Format::Toml
     } else if has("image_width:") || has("distortion_model:") || is_yaml(path) {

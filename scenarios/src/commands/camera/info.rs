@@ -100,14 +100,20 @@ pub(super) fn run(args: &InfoArgs) -> Result<(), CommandError> {
             yaw.to_degrees()
         ),
     );
-    line("focal length", format!("{:.4} {:.4} px", terms.hs, terms.vs));
+    line(
+        "focal length",
+        format!("{:.4} {:.4} px", terms.hs, terms.vs),
+    );
     line("boresight", format!("{:.4} {:.4} px", terms.hc, terms.vc));
     line(
         "skew",
         format!("{:.6} deg", terms.theta_rad.to_degrees() + 90.0),
     );
     if let (Some(centre), Some([_, r])) = (terms.distortion_centre_px, lens) {
-        line("optical axis at", format!("{:.4} {:.4} px", centre.x, centre.y));
+        line(
+            "optical axis at",
+            format!("{:.4} {:.4} px", centre.x, centre.y),
+        );
         line("distortion R", format!("{} {} {}", r.x, r.y, r.z));
     }
     if let Some((e, linearity)) = pupil {

@@ -107,7 +107,9 @@ pub(super) fn project(args: &ProjectArgs) -> Result<(), CommandError> {
             ..
         }) = camera
             && !args.beyond_image
-            && !camera.as_ref().is_some_and(|c| c.contains(&image.pixel_px, 0.0))
+            && !camera
+                .as_ref()
+                .is_some_and(|c| c.contains(&image.pixel_px, 0.0))
         {
             return Err(CameraError::OutsideImage {
                 pixel_px: image.pixel_px,
