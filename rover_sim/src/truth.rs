@@ -13,7 +13,7 @@ use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
-use rover_cameras::{Camera, CameraModel, StereoPair};
+use rover_cameras::{Camera, StereoPair};
 use rover_kinematics::{Arm, ERRORS_PER_JOINT};
 use rover_robot::Robot;
 
@@ -179,10 +179,8 @@ fn disturbed(
     if errors == &IntrinsicsError::default() {
         return Ok(camera);
     }
-    let (a, h, v) = match &mut camera.model {
-        CameraModel::Cahv(m) => (m.a, &mut m.h, &mut m.v),
-        CameraModel::Cahvor(m) => (m.a, &mut m.h, &mut m.v),
-    };
+    let [a, h, v] = camera.model.ahv_mut();
+    let a = *a;
     for (axis, shift) in [(h, shift[0]), (v, shift[1])] {
         let centre = a.dot(axis) / a.norm_squared();
         *axis = (*axis - a * centre) * scale + a * (centre + shift);

@@ -2,6 +2,7 @@
 
 pub mod campaign;
 pub mod arm;
+pub mod camera;
 pub mod doctor;
 pub mod inspect;
 pub mod run;

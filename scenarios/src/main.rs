@@ -1,7 +1,7 @@
 //! The `rover` command.
 
 use clap::{Parser, Subcommand};
-use rover::commands::{CommandError, Exit, arm, campaign, doctor, inspect, run, service, study, up};
+use rover::commands::{CommandError, Exit, arm, camera, campaign, doctor, inspect, run, service, study, up};
 use std::{io::IsTerminal, process::ExitCode};
 use tracing_subscriber::EnvFilter;
 
@@ -24,6 +24,7 @@ enum Command {
     Service(service::ServiceArgs),
     Inspect(inspect::InspectArgs),
     Arm(arm::ArmArgs),
+    Camera(camera::CameraArgs),
     Doctor(doctor::DoctorArgs),
     Study(study::StudyArgs),
 }
@@ -67,6 +68,7 @@ async fn execute(command: Command) -> Result<Exit, CommandError> {
         Command::Service(args) => service::run(args).await,
         Command::Inspect(args) => inspect::run(args).await,
         Command::Arm(args) => arm::run(args),
+        Command::Camera(args) => camera::run(args),
         Command::Doctor(args) => doctor::run(args).await,
         Command::Study(args) => study::run(&args),
     }

@@ -8,7 +8,7 @@
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use nalgebra::{Isometry3, Matrix2, Translation3, Unit, UnitQuaternion, Vector2, Vector3};
-use rover_cameras::{Camera, StereoPair};
+use rover_cameras::{Cahv, Cahvore, Camera, CameraModel, StereoPair};
 use std::hint::black_box;
 
 const CALLS: usize = 1024;
@@ -55,9 +55,30 @@ fn points(camera: &Camera) -> Vec<Vector3<f64>> {
         .collect()
 }
 
+/// The same camera with the lens and the moving pupil of the Mars Exploration Rover's hazard camera.
+fn wide() -> Camera {
+    let mut camera = camera(0.04, false);
+    if let CameraModel::Cahv(Cahv { c, a, h, v }) = camera.model {
+        camera.model = CameraModel::Cahvore(Cahvore {
+            c,
+            a,
+            h,
+            v,
+            o: a,
+            r: Vector3::new(3e-6, -0.012015, -0.007525),
+            e: Vector3::new(0.001442, 0.001522, 0.000483),
+            linearity: 0.37,
+        });
+    }
+    camera
+}
+
 fn single(c: &mut Criterion) {
-    for (name, lens) in [("cahv", false), ("cahvor", true)] {
-        let camera = camera(0.04, lens);
+    for (name, camera) in [
+        ("cahv", camera(0.04, false)),
+        ("cahvor", camera(0.04, true)),
+        ("cahvore", wide()),
+    ] {
         let (pixels, points) = (pixels(), points(&camera));
         let mut group = c.benchmark_group(name);
         group.throughput(Throughput::Elements(CALLS as u64));

@@ -1,6 +1,6 @@
 //! The camera: a model, the size of its image, and what can be asked of it.
 
-use crate::{Cahv, Cahvor, CameraError};
+use crate::{Cahv, Cahvor, Cahvore, CameraError};
 use nalgebra::{Isometry3, Matrix2x3, Matrix3x2, Unit, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
@@ -32,6 +32,18 @@ pub enum CameraModel {
     /// Perspective with radial distortion.
     #[serde(rename = "cahvor", alias = "Cahvor", alias = "CAHVOR")]
     Cahvor(Cahvor),
+    /// Any field of view, with radial distortion and a moving entrance pupil.
+    #[serde(rename = "cahvore", alias = "Cahvore", alias = "CAHVORE")]
+    Cahvore(Cahvore),
+}
+
+/// How a ray changes with its pixel: rows x, y, z of the model's frame; columns u, v.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RayJacobians {
+    /// Of the unit direction, 1/px.
+    pub direction: Matrix3x2<f64>,
+    /// Of the origin, m/px: zero for a camera with a fixed projection centre.
+    pub origin: Matrix3x2<f64>,
 }
 
 /// The half-line of points that a pixel sees, in the camera model's frame.
@@ -59,7 +71,7 @@ pub struct Projection {
     /// Derivative of the pixel with respect to the point, px/m: rows u, v; columns x, y, z of the
     /// model's frame.
     pub jacobian: Matrix2x3<f64>,
-    /// Range along A: of the point for CAHV, of the point after distortion for CAHVOR (the
+    /// Range along A: of the point for CAHV, of the point after distortion for the others (the
     /// denominator of the projection, as the JPL library reports it), metres.
     pub range_m: f64,
 }
@@ -71,6 +83,7 @@ impl CameraModel {
         match self {
             Self::Cahv(model) => model.project(point),
             Self::Cahvor(model) => model.project(point),
+            Self::Cahvore(model) => model.project(point),
         }
     }
 
@@ -80,6 +93,7 @@ impl CameraModel {
         match self {
             Self::Cahv(model) => model.project_with_jacobian(point),
             Self::Cahvor(model) => model.project_with_jacobian(point),
+            Self::Cahvore(model) => model.project_with_jacobian(point),
         }
     }
 
@@ -89,6 +103,7 @@ impl CameraModel {
         match self {
             Self::Cahv(model) => model.ray(pixel_px),
             Self::Cahvor(model) => model.ray(pixel_px),
+            Self::Cahvore(model) => model.ray(pixel_px),
         }
     }
 
@@ -101,7 +116,25 @@ impl CameraModel {
         match self {
             Self::Cahv(model) => model.ray_with_jacobian(pixel_px),
             Self::Cahvor(model) => model.ray_with_jacobian(pixel_px),
+            Self::Cahvore(model) => {
+                let (ray, jacobians) = model.ray_with_jacobians(pixel_px)?;
+                Ok((ray, jacobians.direction))
+            }
         }
+    }
+
+    /// See [`Camera::ray_with_jacobians`]; needs no image size.
+    #[inline]
+    pub fn ray_with_jacobians(
+        &self,
+        pixel_px: &Vector2<f64>,
+    ) -> Result<(Ray, RayJacobians), CameraError> {
+        if let Self::Cahvore(model) = self {
+            return model.ray_with_jacobians(pixel_px);
+        }
+        let (ray, direction) = self.ray_with_jacobian(pixel_px)?;
+        let origin = Matrix3x2::zeros();
+        Ok((ray, RayJacobians { direction, origin }))
     }
 
     /// See [`Camera::transformed`].
@@ -109,6 +142,7 @@ impl CameraModel {
         match self {
             Self::Cahv(model) => Self::Cahv(model.transformed(to_from)),
             Self::Cahvor(model) => Self::Cahvor(model.transformed(to_from)),
+            Self::Cahvore(model) => Self::Cahvore(model.transformed(to_from)),
         }
     }
 
@@ -118,6 +152,27 @@ impl CameraModel {
         match self {
             Self::Cahv(m) => [&m.c, &m.a, &m.h, &m.v],
             Self::Cahvor(m) => [&m.c, &m.a, &m.h, &m.v],
+            Self::Cahvore(m) => [&m.c, &m.a, &m.h, &m.v],
+        }
+    }
+
+    /// The vectors A, H, V for changing.
+    #[inline]
+    pub fn ahv_mut(&mut self) -> [&mut Vector3<f64>; 3] {
+        match self {
+            Self::Cahv(m) => [&mut m.a, &mut m.h, &mut m.v],
+            Self::Cahvor(m) => [&mut m.a, &mut m.h, &mut m.v],
+            Self::Cahvore(m) => [&mut m.a, &mut m.h, &mut m.v],
+        }
+    }
+
+    /// The optical axis O and the distortion coefficients R of a model that has them.
+    #[inline]
+    pub fn lens(&self) -> Option<[&Vector3<f64>; 2]> {
+        match self {
+            Self::Cahv(_) => None,
+            Self::Cahvor(m) => Some([&m.o, &m.r]),
+            Self::Cahvore(m) => Some([&m.o, &m.r]),
         }
     }
 
@@ -126,6 +181,7 @@ impl CameraModel {
         match self {
             Self::Cahv(_) => "CAHV",
             Self::Cahvor(_) => "CAHVOR",
+            Self::Cahvore(_) => "CAHVORE",
         }
     }
 }
@@ -136,10 +192,32 @@ impl Camera {
     ///
     /// # Errors
     /// `BehindCamera`, `OutsideField` if the point is where the distortion is not one-to-one,
-    /// `NotFinite`.
+    /// `NotFinite`; for CAHVORE also `NearPupil` and `PupilNotFound`.
     #[inline]
     pub fn project(&self, point: &Vector3<f64>) -> Result<Vector2<f64>, CameraError> {
         self.model.project(point)
+    }
+
+    /// The pixel at which a point is seen in the image, at least `margin_px` from its border (see
+    /// [`Self::contains`]).
+    ///
+    /// # Errors
+    /// As [`Self::project`], and `OutsideImage`.
+    pub fn project_into_image(
+        &self,
+        point: &Vector3<f64>,
+        margin_px: f64,
+    ) -> Result<Vector2<f64>, CameraError> {
+        let pixel_px = self.project(point)?;
+        if self.contains(&pixel_px, margin_px) {
+            return Ok(pixel_px);
+        }
+        Err(CameraError::OutsideImage {
+            pixel_px,
+            width_px: self.width_px,
+            height_px: self.height_px,
+            margin_px,
+        })
     }
 
     /// [`Self::project`] with the exact derivative of the pixel with respect to the point.
@@ -158,7 +236,8 @@ impl Camera {
     /// [`Self::project`]. Published models carry six digits; if their O is longer or shorter than
     /// 1 by `e`, a round trip errs by a few `e |mu|` focal lengths: 1e-10 to 1e-8 px at the
     /// corners for most, 5e-6 px for the worst flight model in our tests (`e` = 4e-4).
-    /// [`Self::with_unit_axes`] removes it.
+    /// [`Self::with_unit_axes`] removes it. A CAHVORE ray is measured from O as a whole, so that
+    /// its round trip errs by about `e` focal lengths.
     ///
     /// # Errors
     /// `OutsideField` if the pixel is further out than the distortion is one-to-one,
@@ -169,8 +248,8 @@ impl Camera {
     }
 
     /// [`Self::ray`] with the exact derivative of its unit direction with respect to the pixel,
-    /// 1/px (rows x, y, z of the model's frame; columns u, v). The origin does not depend on the
-    /// pixel.
+    /// 1/px (rows x, y, z of the model's frame; columns u, v). The origin of a
+    /// CAHVORE ray depends on the pixel too: see [`Self::ray_with_jacobians`].
     ///
     /// # Errors
     /// As [`Self::ray`].
@@ -180,6 +259,18 @@ impl Camera {
         pixel_px: &Vector2<f64>,
     ) -> Result<(Ray, Matrix3x2<f64>), CameraError> {
         self.model.ray_with_jacobian(pixel_px)
+    }
+
+    /// [`Self::ray`] with the exact derivatives of its direction and its origin.
+    ///
+    /// # Errors
+    /// As [`Self::ray`].
+    #[inline]
+    pub fn ray_with_jacobians(
+        &self,
+        pixel_px: &Vector2<f64>,
+    ) -> Result<(Ray, RayJacobians), CameraError> {
+        self.model.ray_with_jacobians(pixel_px)
     }
 
     /// Whether a pixel lies inside the image and at least `margin_px` from its border.
@@ -214,13 +305,12 @@ impl Camera {
     /// `InvalidModel` if A or O is zero or not finite.
     pub fn with_unit_axes(&self) -> Result<Camera, CameraError> {
         let mut camera = self.clone();
-        let (a, h, v) = match &mut camera.model {
-            CameraModel::Cahv(m) => (&mut m.a, &mut m.h, &mut m.v),
-            CameraModel::Cahvor(m) => {
-                m.o /= length("O", &m.o)?;
-                (&mut m.a, &mut m.h, &mut m.v)
-            }
-        };
+        match &mut camera.model {
+            CameraModel::Cahv(_) => {}
+            CameraModel::Cahvor(m) => m.o /= length("O", &m.o)?,
+            CameraModel::Cahvore(m) => m.o /= length("O", &m.o)?,
+        }
+        let [a, h, v] = camera.model.ahv_mut();
         let scale = length("A", a)?;
         for vector in [a, h, v] {
             *vector /= scale;
@@ -234,7 +324,8 @@ impl Camera {
     /// `InvalidModel`, naming vector, value found and value expected, unless: both sizes are
     /// positive; all vectors are finite; A and O are of unit length to 1e-3; H and V point at
     /// least 5.7 degrees away from A's line and from each other's plane with it, with scales of at
-    /// least 1e-3 px; O is within 90 degrees of A; and `1 + r0` is positive.
+    /// least 1e-3 px; O is within 90 degrees of A; `1 + r0` is
+    /// positive; E is finite and the linearity between -1 and 1.
     pub fn validate(&self) -> Result<(), CameraError> {
         if self.width_px == 0 || self.height_px == 0 {
             return Err(invalid(format!(
@@ -273,20 +364,29 @@ impl CameraModel {
                  expected at least {MIN_SINE}"
             )));
         }
-        let Self::Cahvor(model) = self else {
+        let Some([o, r]) = self.lens() else {
             return Ok(());
         };
-        check_finite("O", &model.o)?;
-        check_finite("R", &model.r)?;
-        check_unit("O", &model.o)?;
-        let cosine = model.o.dot(a);
+        check_finite("O", o)?;
+        check_finite("R", r)?;
+        check_unit("O", o)?;
+        let cosine = o.dot(a);
         if !(cosine > 0.0) {
             return Err(invalid(format!(
                 "O points away from A: their cosine is {cosine}, expected above 0"
             )));
         }
-        if !(1.0 + model.r.x > 0.0) {
-            return Err(invalid(format!("r0 is {}, expected above -1", model.r.x)));
+        if !(1.0 + r.x > 0.0) {
+            return Err(invalid(format!("r0 is {}, expected above -1", r.x)));
+        }
+        if let Self::Cahvore(model) = self {
+            check_finite("E", &model.e)?;
+            if !(model.linearity.abs() <= 1.0) {
+                return Err(invalid(format!(
+                    "the linearity is {}, expected -1 to 1",
+                    model.linearity
+                )));
+            }
         }
         Ok(())
     }

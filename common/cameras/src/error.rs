@@ -45,6 +45,48 @@ pub enum CameraError {
         /// The last change of the ratio of undistorted to distorted radius.
         last_step: f64,
     },
+    /// The point lies at the entrance pupil, or so near that several rays of the lens reach it.
+    #[error(
+        "the point [{} {} {}] m lies {distance_m} m in front of the entrance pupil, inside the \
+         lens: no single ray reaches it",
+        point.x, point.y, point.z
+    )]
+    NearPupil {
+        /// The point, in the model's frame, metres.
+        point: Vector3<f64>,
+        /// Its distance along the ray from the moving entrance pupil, metres.
+        distance_m: f64,
+    },
+    /// The angle at which a point is seen through the moving entrance pupil did not settle.
+    #[error(
+        "the ray to the point [{} {} {}] m was not found: after {iterations} iterations the last \
+         step was {last_step} rad, expected below 1e-10",
+        point.x, point.y, point.z
+    )]
+    PupilNotFound {
+        /// The point, in the model's frame, metres.
+        point: Vector3<f64>,
+        /// Iterations made.
+        iterations: u32,
+        /// The last change of the angle from O, radians.
+        last_step: f64,
+    },
+    /// The point is imaged beyond the borders of the image.
+    #[error(
+        "the point is imaged at ({}, {}) px, outside the {width_px} x {height_px} px image with a \
+         margin of {margin_px} px",
+        pixel_px.x, pixel_px.y
+    )]
+    OutsideImage {
+        /// Where it is imaged.
+        pixel_px: Vector2<f64>,
+        /// Width of the image, px.
+        width_px: u32,
+        /// Height of the image, px.
+        height_px: u32,
+        /// The distance from the border that was asked for, px.
+        margin_px: f64,
+    },
     /// An input or a vector of the model is NaN or infinite, or the answer overflows.
     #[error("the point, the pixel or a vector of the camera model is not a finite number")]
     NotFinite,

@@ -1,37 +1,42 @@
-//! The plain text form in which CAHV models are commonly exchanged.
+//! Files of camera models, and the models of other tools.
 //!
-//! ```text
-//! # a comment, up to the end of the line
-//! Model = CAHVOR
-//! Dimensions = 1024 1024
-//! Frame = rover
-//! C = 0.46726 0.130406 -1.24047
-//! A = -0.726097 0.604262 0.328103
-//! H = -1144.99 -638.601 168.422
-//! V = -53.3346 50.7325 1320.91
-//! O = -0.735599 0.581747 0.34708
-//! R = 0.00096 -0.002183 0.018547
-//! ```
+//! | module | format |
+//! |---|---|
+//! | [`text`] | the plain text form of CAHV models |
+//! | [`toml`] | [`ModelFile`] as TOML |
+//! | [`ros`] | ROS `CameraInfo` YAML |
+//! | [`opencv`] | OpenCV `FileStorage` YAML |
+//! | [`kalibr`] | Kalibr camera chains |
 //!
-//! One `NAME = values` line each, in any order. C, A, H, V are required; with O and R the model is
-//! CAHVOR, without them CAHV. `Dimensions` (width and height, px), `Model` (its first word; what
-//! follows another `=` is a description) and `Frame` (the frame of the vectors) may be missing; if
-//! `Model` is there it must agree with the vectors. Any other line is refused with its number: the
-//! reader never guesses what it leaves out. `Frame` is ours; the other lines are those of the JPL
-//! calibration programs, whose covariance and internal-parameter blocks have to be cut off.
+//! The latter three hold pinhole cameras with the distortions of OpenCV ([`Lens`]);
+//! [`conversion`] takes them to the CAHV family and back, exactly where the formulas are the same
+//! and by a fit with its worst error where they are not.
 
-use crate::{Cahv, Cahvor, Camera, CameraError, CameraModel};
-use nalgebra::Vector3;
+pub mod conversion;
+pub mod kalibr;
+mod lens;
+pub mod opencv;
+pub mod ros;
+pub mod text;
+pub mod toml;
+mod yaml;
+
+pub use conversion::{Conversion, ConversionError, ConversionRules, Family};
+pub use lens::{Lens, LensCamera};
+pub use text::{read_text, write_text};
+pub use toml::{read_toml, write_toml};
+
+use crate::{Camera, CameraError, CameraModel};
 use serde::{Deserialize, Serialize};
-use std::fmt::Write;
 use thiserror::Error;
 
-/// Longest text that is read, bytes. A model takes less than one thousand.
+/// Longest text that is read, bytes. A model takes less than one thousand, a chain of cameras a
+/// few.
 pub const MAX_BYTES: usize = 65_536;
 /// Longest frame name, characters.
 pub const MAX_FRAME_CHARS: usize = 64;
 const MAX_SHOWN_CHARS: usize = 40;
-const KNOWN: &str = "C, A, H, V, O, R, Model, Dimensions or Frame";
+const KNOWN: &str = "C, A, H, V, O, R, E, T, P, Model, Dimensions or Frame";
 
 /// A camera model with what its file says about it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -86,10 +91,10 @@ pub enum FormatError {
         /// What was expected.
         expected: &'static str,
     },
-    /// A vector is missing.
-    #[error("{name} is missing, expected a line {name} = x y z")]
+    /// A line is missing that the others call for.
+    #[error("{name} is missing, expected a line {name} = ...")]
     Missing {
-        /// The vector's name.
+        /// The name of the line.
         name: &'static str,
     },
     /// `Model` names another model than the vectors make.
@@ -105,6 +110,25 @@ pub enum FormatError {
     /// A camera needs an image size and the file has none.
     #[error("the image size is missing, expected a line Dimensions = WIDTH HEIGHT")]
     NoSize,
+    /// The text is not YAML, or not of the structure that the format has.
+    #[error("{message}")]
+    Structure {
+        /// What the reader says, with line and column where it knows them.
+        message: String,
+    },
+    /// A field of a YAML format holds what cannot be used.
+    #[error("{field}: found {found}, expected {expected}")]
+    Field {
+        /// The field, with the names above it.
+        field: String,
+        /// The start of what was found.
+        found: String,
+        /// What was expected.
+        expected: String,
+    },
+    /// The model cannot be expressed in the other format.
+    #[error(transparent)]
+    Conversion(#[from] ConversionError),
     /// The numbers do not make a camera.
     #[error(transparent)]
     Camera(#[from] CameraError),
@@ -134,228 +158,21 @@ impl ModelFile {
     }
 }
 
-/// A value and the line that gave it.
-struct Given<T> {
-    line: usize,
-    value: T,
-}
-
-const VECTORS: [&str; 6] = ["C", "A", "H", "V", "O", "R"];
-
-/// Reads a camera model from its plain text form.
-///
-/// # Errors
-/// [`FormatError`], with the number of the line at fault; `Camera(InvalidModel)` if the numbers
-/// read do not make a camera (see [`Camera::validate`]).
-pub fn read_text(text: &str) -> Result<ModelFile, FormatError> {
-    if text.len() > MAX_BYTES {
-        return Err(FormatError::TooLong { found: text.len() });
-    }
-    let mut vectors: [Option<Given<Vector3<f64>>>; 6] = Default::default();
-    let mut model_name: Option<Given<&str>> = None;
-    let mut size_px: Option<Given<[u32; 2]>> = None;
-    let mut frame: Option<Given<&str>> = None;
-    let text = text.strip_prefix('\u{feff}').unwrap_or(text);
-    for (index, full) in text.lines().enumerate() {
-        let line = index + 1;
-        let content = full.split('#').next().unwrap_or_default().trim();
-        if content.is_empty() {
-            continue;
-        }
-        let unknown = || FormatError::UnknownLine {
-            line,
-            found: shown(content),
-        };
-        let (name, value) = content.split_once('=').ok_or_else(unknown)?;
-        let value = value.trim();
-        match name.trim() {
-            "Model" => {
-                let word = value.split('=').next().unwrap_or_default().trim();
-                set(&mut model_name, line, "Model", word)?;
-            }
-            "Dimensions" => set(&mut size_px, line, "Dimensions", read_size(line, value)?)?,
-            "Frame" => set(&mut frame, line, "Frame", read_frame(line, value)?)?,
-            name => {
-                let at = VECTORS
-                    .iter()
-                    .position(|known| *known == name)
-                    .ok_or_else(unknown)?;
-                let name = VECTORS[at];
-                set(
-                    &mut vectors[at],
-                    line,
-                    name,
-                    read_vector(line, name, value)?,
-                )?;
-            }
-        }
-    }
-    let model = assemble(vectors)?;
-    if let Some(Given { line, value }) = model_name
-        && value != model.name()
-    {
-        let expected = model.name();
-        return Err(FormatError::OtherModel {
-            line,
-            found: shown(value),
-            expected,
-        });
-    }
-    model.validate()?;
-    Ok(ModelFile {
-        frame: frame.map(|given| given.value.to_owned()),
-        size_px: size_px.map(|given| given.value),
-        model,
-    })
-}
-
-fn assemble(vectors: [Option<Given<Vector3<f64>>>; 6]) -> Result<CameraModel, FormatError> {
-    let distorted = vectors[4].is_some() || vectors[5].is_some();
-    let [c, a, h, v, o, r] = vectors.map(|given| given.map(|given| given.value));
-    let need = |vector: Option<Vector3<f64>>, name| vector.ok_or(FormatError::Missing { name });
-    let (c, a, h, v) = (need(c, "C")?, need(a, "A")?, need(h, "H")?, need(v, "V")?);
-    Ok(if distorted {
-        CameraModel::Cahvor(Cahvor {
-            c,
-            a,
-            h,
-            v,
-            o: need(o, "O")?,
-            r: need(r, "R")?,
-        })
-    } else {
-        CameraModel::Cahv(Cahv { c, a, h, v })
-    })
-}
-
-/// Writes a camera in the plain text form. Numbers are written with as many digits as it takes to
-/// read the same camera back.
-///
-/// # Errors
-/// [`FormatError::FrameName`] if the format cannot hold the name of the frame, or
-/// [`FormatError::Camera`] if the camera is not valid and so could not be read back.
-pub fn write_text(camera: &Camera, frame: Option<&str>) -> Result<String, FormatError> {
-    camera.validate()?;
-    let Camera {
-        model,
-        width_px,
-        height_px,
-    } = camera;
-    let mut text = format!(
-        "Model = {}\nDimensions = {width_px} {height_px}\n",
-        model.name()
-    );
-    if let Some(frame) = frame {
-        if !is_frame_name(frame) {
-            return Err(FormatError::FrameName {
-                found: shown(frame),
-            });
-        }
-        push_line(&mut text, "Frame", &frame);
-    }
-    for (name, vector) in VECTORS.iter().zip(model.cahv()) {
-        push_line(
-            &mut text,
-            name,
-            &format_args!("{} {} {}", vector.x, vector.y, vector.z),
-        );
-    }
-    if let CameraModel::Cahvor(Cahvor { o, r, .. }) = model {
-        for (name, vector) in [("O", o), ("R", r)] {
-            push_line(
-                &mut text,
-                name,
-                &format_args!("{} {} {}", vector.x, vector.y, vector.z),
-            );
-        }
-    }
-    Ok(text)
-}
-
-fn push_line(text: &mut String, name: &str, value: &dyn std::fmt::Display) {
-    // Writing to a String cannot fail.
-    let _ = writeln!(text, "{name} = {value}");
-}
-
-fn set<T>(
-    slot: &mut Option<Given<T>>,
-    line: usize,
-    name: &'static str,
-    value: T,
-) -> Result<(), FormatError> {
-    if let Some(Given { line: first, .. }) = slot {
-        return Err(FormatError::Repeated {
-            line,
-            name,
-            first: *first,
-        });
-    }
-    *slot = Some(Given { line, value });
-    Ok(())
-}
-
-/// Exactly `N` words, each taken by `read`.
-fn read_words<T: Copy + Default, const N: usize>(
-    value: &str,
-    read: impl Fn(&str) -> Option<T>,
-) -> Option<[T; N]> {
-    let mut words = value.split_ascii_whitespace();
-    let mut found = [T::default(); N];
-    for slot in &mut found {
-        *slot = read(words.next()?)?;
-    }
-    words.next().is_none().then_some(found)
-}
-
-fn read_vector(line: usize, name: &'static str, value: &str) -> Result<Vector3<f64>, FormatError> {
-    read_words::<f64, 3>(value, |word| {
-        word.parse().ok().filter(|x: &f64| x.is_finite())
-    })
-    .map(Vector3::from)
-    .ok_or_else(|| FormatError::Value {
-        line,
-        name,
-        found: shown(value),
-        expected: "three finite numbers",
-    })
-}
-
-fn read_size(line: usize, value: &str) -> Result<[u32; 2], FormatError> {
-    read_words(value, |word| word.parse().ok().filter(|x: &u32| *x > 0)).ok_or_else(|| {
-        FormatError::Value {
-            line,
-            name: "Dimensions",
-            found: shown(value),
-            expected: "two positive whole numbers",
-        }
-    })
-}
-
-fn read_frame(line: usize, value: &str) -> Result<&str, FormatError> {
-    if is_frame_name(value) {
-        return Ok(value);
-    }
-    Err(FormatError::Value {
-        line,
-        name: "Frame",
-        found: shown(value),
-        expected: "1 to 64 printable ASCII characters",
-    })
-}
-
-fn is_frame_name(name: &str) -> bool {
-    (1..=MAX_FRAME_CHARS).contains(&name.len())
-        && name.trim() == name
-        && name
-            .bytes()
-            .all(|b| (b' '..=b'~').contains(&b) && b != b'#')
-}
-
 /// The start of a text, short enough for a message.
-fn shown(text: &str) -> String {
+pub(crate) fn shown(text: &str) -> String {
     let mut short: String = text.chars().take(MAX_SHOWN_CHARS).collect();
     if text.chars().nth(MAX_SHOWN_CHARS).is_some() {
         short.push_str("...");
     }
     short
+}
+
+/// A message of another reader in one line of bounded length, free of control characters.
+pub(crate) fn brief(message: &str) -> String {
+    const LONGEST: usize = 300;
+    let line = message.split_whitespace().collect::<Vec<_>>().join(" ");
+    line.chars()
+        .map(|c| if c.is_control() { '?' } else { c })
+        .take(LONGEST)
+        .collect()
 }

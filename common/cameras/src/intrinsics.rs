@@ -50,10 +50,10 @@ impl Camera {
             theta_rad: v_unit.cross(&x).dot(&z).atan2(v_unit.dot(&x)),
             position: *c,
             camera_from_model: Rotation3::from_matrix_unchecked(axes),
-            distortion_centre_px: match &self.model {
-                CameraModel::Cahv(_) => None,
-                CameraModel::Cahvor(m) => Some(Vector2::new(m.o.dot(h), m.o.dot(v)) / m.o.dot(a)),
-            },
+            distortion_centre_px: self
+                .model
+                .lens()
+                .map(|[o, _]| Vector2::new(o.dot(h), o.dot(v)) / o.dot(a)),
         }
     }
 

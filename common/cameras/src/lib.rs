@@ -18,6 +18,7 @@
 //! |---|---|---|
 //! | [`Cahv`] | C A H V | `u = d.H / d.A`, `v = d.V / d.A` |
 //! | [`Cahvor`] | C A H V O R | the same, of `d + mu l`: `l = d - (d.O) O`, `tau = l.l / (d.O)^2`, `mu = r0 + r1 tau + r2 tau^2` |
+//! | [`Cahvore`] | C A H V O R E, linearity | as CAHVOR, but about an entrance pupil that moves along O, and with a projection of angles between perspective and fisheye |
 //!
 //! C is the projection centre, A the unit normal of the image plane,
 //! `H = hs H' + hc A` and `V = vs V' + vc A` with the unit vectors H' (right) and V' (down) in the
@@ -39,9 +40,6 @@
 //!   ([`CameraError::OutsideField`]), as is everything behind the camera or not finite. No answer
 //!   is ever NaN.
 //! - Nothing in projection, ray or triangulation allocates.
-//!
-//! What is not here: the model of wide-angle lenses with a moving entrance pupil (CAHVORE), and
-//! calibration.
 //!
 //! # Example
 //!
@@ -87,24 +85,32 @@
 //! 2. D. B. Gennery, "Least-squares camera calibration including lens distortion and automatic
 //!    editing of calibration points", in Calibration and Orientation of Cameras in Computer Vision,
 //!    2001 (CAHVOR).
-//! 3. T. Litwin, cmod, the JPL camera model library, in NASA-AMMOS/VICAR, `vos/p2/sub/cahvor`.
+//! 3. D. B. Gennery, "Generalized camera calibration including fish-eye lenses", International
+//!    Journal of Computer Vision 68, 2006 (CAHVORE).
+//! 4. T. Litwin, cmod, the JPL camera model library, in NASA-AMMOS/VICAR, `vos/p2/sub/cahvor`.
 
 // `!(x > limit)` is meant: a NaN has to take the branch of the error.
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
 mod cahv;
 mod cahvor;
+mod cahvore;
+pub mod calibration;
 mod camera;
 mod error;
 pub mod formats;
 mod intrinsics;
+mod least_squares;
 mod linear;
+mod pupil;
 mod radial;
 mod stereo;
+mod window;
 
 pub use cahv::Cahv;
 pub use cahvor::Cahvor;
-pub use camera::{Camera, CameraModel, Projection, Ray};
+pub use cahvore::Cahvore;
+pub use camera::{Camera, CameraModel, Projection, Ray, RayJacobians};
 pub use error::CameraError;
 pub use intrinsics::Intrinsics;
 pub use stereo::{MissLimit, Side, StereoPair, Triangulation, TriangulationError, closest_point};

@@ -1,6 +1,6 @@
 //! Two rays, one point: triangulation, its covariance, and the epipolar curve.
 
-use crate::{Camera, CameraError, Ray};
+use crate::{Camera, CameraError, Ray, RayJacobians};
 use nalgebra::{Isometry3, Matrix2, Matrix3, Matrix3x2, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 use std::fmt;
@@ -236,8 +236,8 @@ impl StereoPair {
         left_px: &Vector2<f64>,
         right_px: &Vector2<f64>,
     ) -> Result<(Triangulation, [Matrix3x2<f64>; 2]), TriangulationError> {
-        let (left, du) = self.left.ray_with_jacobian(left_px)?;
-        let (right, dv) = self.right.ray_with_jacobian(right_px)?;
+        let (left, left_by) = self.left.ray_with_jacobians(left_px)?;
+        let (right, right_by) = self.right.ray_with_jacobians(right_px)?;
         let found = closest_point(&left, &right)?;
         let (u, v) = (left.direction.as_ref(), right.direction.as_ref());
         let (s, t) = (found.range_left_m, found.range_right_m);
@@ -247,18 +247,32 @@ impl StereoPair {
         let cosine = u.dot(v);
         let sine2 = u.cross(v).norm_squared();
         let ranges = |f1: f64, f2: f64| ((-f1 + cosine * f2) / sine2, (-cosine * f1 + f2) / sine2);
-        let by_left = |du: Vector3<f64>| {
-            let (ds, dt) = ranges((e + u * s).dot(&du), v.dot(&du) * s);
-            (du * s + u * ds + v * dt) * 0.5
+        let by_left = |du: Vector3<f64>, dp: Vector3<f64>| {
+            let (ds, dt) = ranges(
+                (e + u * s).dot(&du) + u.dot(&dp),
+                v.dot(&du) * s + v.dot(&dp),
+            );
+            (dp + du * s + u * ds + v * dt) * 0.5
         };
-        let by_right = |dv: Vector3<f64>| {
-            let (ds, dt) = ranges(-u.dot(&dv) * t, (e - v * t).dot(&dv));
-            (dv * t + u * ds + v * dt) * 0.5
+        let by_right = |dv: Vector3<f64>, dp: Vector3<f64>| {
+            let (ds, dt) = ranges(
+                -u.dot(&dv) * t - u.dot(&dp),
+                (e - v * t).dot(&dv) - v.dot(&dp),
+            );
+            (dp + dv * t + u * ds + v * dt) * 0.5
         };
-        let columns = |d: &Matrix3x2<f64>, by: &dyn Fn(Vector3<f64>) -> Vector3<f64>| {
-            Matrix3x2::from_columns(&[by(d.column(0).into_owned()), by(d.column(1).into_owned())])
-        };
-        Ok((found, [columns(&du, &by_left), columns(&dv, &by_right)]))
+        let columns =
+            |d: &RayJacobians, by: &dyn Fn(Vector3<f64>, Vector3<f64>) -> Vector3<f64>| {
+                let column = |i: usize| {
+                    by(
+                        d.direction.column(i).into_owned(),
+                        d.origin.column(i).into_owned(),
+                    )
+                };
+                Matrix3x2::from_columns(&[column(0), column(1)])
+            };
+        let jacobians = [columns(&left_by, &by_left), columns(&right_by, &by_right)];
+        Ok((found, jacobians))
     }
 
     /// The pair with its vectors in another frame; see [`Camera::transformed`].

@@ -4,6 +4,7 @@
 // `!(x >= limit)` refuses a NaN as well, which `x < limit` would let through
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
+pub mod board;
 pub mod fiducial;
 pub mod harris;
 pub mod image;

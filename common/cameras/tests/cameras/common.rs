@@ -1,7 +1,7 @@
 //! The reference models and vectors, shared by the tests of this crate.
 
 use nalgebra::{Matrix2x3, Matrix3x2, Vector2, Vector3};
-use rover_cameras::{Cahv, Cahvor, Camera, CameraModel};
+use rover_cameras::{Cahv, Cahvor, Cahvore, Camera, CameraModel};
 use serde_json::Value;
 
 /// One model of the reference file with the projections that the JPL library computed for it.
@@ -46,6 +46,20 @@ fn reference(model: &Value) -> Reference {
             v,
             o: vector("O"),
             r: vector("R"),
+        }),
+        "CAHVORE" => CameraModel::Cahvore(Cahvore {
+            c,
+            a,
+            h,
+            v,
+            o: vector("O"),
+            r: vector("R"),
+            e: vector("E"),
+            linearity: match model["mtype"].as_i64().unwrap() {
+                1 => 1.0,
+                2 => 0.0,
+                _ => model["mparm"].as_f64().unwrap(),
+            },
         }),
         other => panic!("unexpected type {other}"),
     };

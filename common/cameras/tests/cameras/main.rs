@@ -1,7 +1,10 @@
 //! The camera models against references that share no code with them.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
+mod cahvore;
+mod calibration;
 mod common;
+mod conversion;
 mod formats;
 mod models;
 mod reference;

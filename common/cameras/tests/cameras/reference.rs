@@ -1,7 +1,7 @@
-//! Agreement with the JPL library on every CAHV and CAHVOR reference vector: pixels to 1e-9 px,
-//! ray directions to 1e-12, derivatives to 1e-12 of their size but for those of CAHVOR rays: the
-//! library's own differ from central differences of its own rays by up to 3e-3, ours by less than
-//! 1e-7 (see the round trip tests).
+//! Agreement with the JPL library on every reference vector: pixels to 1e-9 px, ray directions to
+//! 1e-12, derivatives to 1e-12 of their size but for those of CAHVOR rays and of CAHVORE: the
+//! library's own differ from central differences of its own answers by up to 3e-3, ours by less
+//! than 1e-7 (see the round trip tests).
 
 use crate::common::references;
 use nalgebra::{Matrix3, Vector3};
@@ -21,8 +21,12 @@ fn points_project_to_the_reference_pixels() {
                 model.name
             );
             let error = (image.jacobian - vector.jacobian).amax() / vector.jacobian.amax();
+            let limit = match model.camera.model {
+                CameraModel::Cahvore(_) => 1e-5,
+                _ => 1e-12,
+            };
             assert!(
-                error < 1e-12,
+                error < limit,
                 "{}: relative jacobian error {error}",
                 model.name
             );
@@ -36,9 +40,10 @@ fn pixels_have_the_reference_rays() {
     for model in references() {
         for vector in &model.rays {
             let (ray, jacobian) = model.camera.ray_with_jacobian(&vector.pixel_px).unwrap();
-            let error = (ray.direction.as_ref() - vector.direction).amax();
+            let error = (ray.direction.as_ref() - vector.direction.normalize()).amax();
             assert!(error < 1e-12, "{}: direction error {error}", model.name);
-            assert_eq!(ray.origin, vector.origin, "{}", model.name);
+            let error_m = (ray.origin - vector.origin).amax();
+            assert!(error_m < 1e-12, "{}: origin error {error_m} m", model.name);
             let error = (jacobian - vector.jacobian).amax() / vector.jacobian.amax();
             let limit = match model.camera.model {
                 CameraModel::Cahv(_) => 1e-12,
@@ -58,7 +63,7 @@ fn pixels_have_the_reference_rays() {
 #[test]
 fn reference_models_are_valid() {
     let models = references();
-    assert_eq!(models.len(), 7);
+    assert_eq!(models.len(), 10);
     for model in models {
         model.camera.validate().unwrap();
     }

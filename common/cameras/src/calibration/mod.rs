@@ -1,0 +1,325 @@
+//! Unsurveyed calibration: one camera or a stereo pair from views of a planar board whose poses
+//! nobody measured (paper, reference 14).
+//!
+//! Start values come from the views alone (homographies, focal length from their orthogonality
+//! conditions, poses from the homographies); then intrinsics, the pose of the right camera and all
+//! poses of the board are adjusted together by robust least squares, outliers are rejected, and
+//! the covariance of everything follows from the normal equations.
+//!
+//! **Frame.** The models are given in the axes of the left camera: origin at its C, x along H'
+//! (right), z along A (forward), y completing them (down). Nothing in the views says where the
+//! rover is; [`crate::Camera::transformed`] takes both to another frame. The scale is that of the
+//! board.
+//!
+//! **What is held.** The pixel grid is rectangular (no skew), and `r0 = 0`, which is a factor of the
+//! focal lengths. O and E are drawn weakly to `O = A` and `E = 0` ([`CalibrationRules`]), because a
+//! lens with little distortion does not show where its axis is, nor one far from the board where
+//! its pupil is.
+
+mod adjust;
+mod rig;
+mod start;
+
+use crate::{Camera, CameraError};
+use adjust::Adjustment;
+use nalgebra::{DMatrix, Isometry3, Vector2};
+use rig::Rig;
+use thiserror::Error;
+
+/// A corner of the board, seen.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BoardPoint {
+    /// Its place on the board, metres.
+    pub board_m: Vector2<f64>,
+    /// Where it was found, px.
+    pub pixel_px: Vector2<f64>,
+}
+
+/// The corners that each camera found in one placement of the board, in the order of the cameras
+/// (left, right); empty for a camera that did not find it.
+pub type BoardView = Vec<Vec<BoardPoint>>;
+
+/// The model to be fitted.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum ModelKind {
+    /// Without distortion.
+    Cahv,
+    /// Radial distortion about O.
+    Cahvor,
+    /// Any field of view and a moving pupil, with this linearity (see [`crate::Cahvore`]).
+    Cahvore {
+        /// 1 perspective, 0 fisheye, or between.
+        linearity: f64,
+    },
+}
+
+/// How a calibration is done.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CalibrationRules {
+    /// The model of every camera.
+    pub model: ModelKind,
+    /// Errors beyond this many sigma weigh less (Huber) until the outliers are known.
+    pub huber_sigma: f64,
+    /// Corners farther off than this many sigma are rejected.
+    pub reject_sigma: f64,
+    /// Prior standard deviation of O's tilt against A, radians per axis.
+    pub axis_sigma_rad: f64,
+    /// Prior standard deviation of each coefficient of R.
+    pub distortion_sigma: f64,
+    /// Prior standard deviation of each coefficient of E, metres.
+    pub pupil_sigma_m: f64,
+}
+
+impl Default for CalibrationRules {
+    fn default() -> Self {
+        Self {
+            model: ModelKind::Cahvor,
+            huber_sigma: 2.0,
+            reject_sigma: 4.0,
+            axis_sigma_rad: 0.01,
+            distortion_sigma: 1.0,
+            pupil_sigma_m: 0.003,
+        }
+    }
+}
+
+/// One estimated number.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Parameter {
+    /// `left.fx_px`, `right.r1`, `right.turn_x_rad`, ...
+    pub name: String,
+    /// Its value.
+    pub value: f64,
+    /// Its standard deviation.
+    pub sigma: f64,
+}
+
+/// One corner after the adjustment.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Residual {
+    /// Placement of the board, from 0.
+    pub view: usize,
+    /// Camera: 0 left, 1 right.
+    pub camera: usize,
+    /// Where it was found, px.
+    pub pixel_px: Vector2<f64>,
+    /// Found minus modelled, px.
+    pub error_px: Vector2<f64>,
+    /// Whether it was used; `false` for an outlier.
+    pub used: bool,
+}
+
+/// The result.
+#[derive(Clone, Debug)]
+pub struct Calibration {
+    /// The cameras, all in the axes of the first.
+    pub cameras: Vec<Camera>,
+    /// Parameters of the cameras; those of the board's poses are not listed.
+    pub parameters: Vec<Parameter>,
+    /// Covariance of `parameters` in their order, the poses of the board left free.
+    pub covariance: DMatrix<f64>,
+    /// Takes the board's coordinates to the axes of the first camera, per view.
+    pub camera_from_board: Vec<Isometry3<f64>>,
+    /// Every corner.
+    pub residuals: Vec<Residual>,
+    /// Root mean square of the distance found to modelled over the corners used, px, per camera.
+    pub rms_px: Vec<f64>,
+    /// Standard deviation of one coordinate of one corner, px.
+    pub sigma_px: f64,
+    /// Corners rejected.
+    pub rejected: usize,
+}
+
+/// Why there is no calibration.
+#[derive(Clone, Debug, PartialEq, Error)]
+pub enum CalibrationError {
+    /// Too little was seen.
+    #[error("camera {camera} sees the board in {found} views, expected at least {expected}")]
+    TooFewViews {
+        /// 0 left, 1 right.
+        camera: usize,
+        /// Views with enough corners.
+        found: usize,
+        /// The least number.
+        expected: usize,
+    },
+    /// Two cameras never saw the board together.
+    #[error("no view shows the board to both cameras")]
+    NoCommonView,
+    /// A view's content cannot be used.
+    #[error("view {view}: {reason}")]
+    View {
+        /// Placement of the board, from 0.
+        view: usize,
+        /// What is wrong.
+        reason: String,
+    },
+    /// No start values led to an image of the board.
+    #[error("camera {camera}: no focal length explains its views")]
+    NoStart {
+        /// 0 left, 1 right.
+        camera: usize,
+    },
+    /// The views leave a parameter open.
+    #[error(
+        "the views do not determine {parameter}: its standard deviation is {sigma} at a value of \
+         {value}; views of the board tilted by 20 to 50 degrees about both axes are needed"
+    )]
+    Undetermined {
+        /// The parameter.
+        parameter: String,
+        /// Its value.
+        value: f64,
+        /// Its standard deviation.
+        sigma: f64,
+    },
+    /// The adjustment did not settle.
+    #[error("the adjustment did not settle within {iterations} iterations")]
+    NotSettled {
+        /// Iterations made.
+        iterations: u32,
+    },
+    /// The result is no camera.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
+}
+
+/// Least number of corners that make a view.
+pub const MIN_CORNERS: usize = 8;
+/// Least number of views per camera.
+pub const MIN_VIEWS: usize = 3;
+const ITERATIONS: u32 = 100;
+const ROUNDS: usize = 8;
+/// Largest relative standard deviation of a focal length that counts as determined.
+const MAX_FOCAL_SIGMA: f64 = 0.1;
+
+/// Calibrates one camera or a pair from what they saw of a board.
+///
+/// `sizes_px` has width and height of each camera's image; every view holds as many lists of
+/// corners as there are cameras (one or two).
+///
+/// # Errors
+/// [`CalibrationError`].
+pub fn calibrate(
+    sizes_px: &[[u32; 2]],
+    views: &[BoardView],
+    rules: &CalibrationRules,
+) -> Result<Calibration, CalibrationError> {
+    check(sizes_px, views)?;
+    let start = start::rig(sizes_px, views, rules)?;
+    let mut adjustment = Adjustment::new(views, rules);
+    let mut rig = start;
+    for round in 0..ROUNDS {
+        let minimum = adjustment
+            .run(rig.clone(), ITERATIONS)
+            .ok_or(CalibrationError::NotSettled { iterations: 0 })?;
+        rig = minimum.state;
+        if !minimum.settled && round + 1 == ROUNDS {
+            return Err(CalibrationError::NotSettled {
+                iterations: minimum.iterations,
+            });
+        }
+        // First robust with a scale from the bulk, then plain without the outliers.
+        let changed = adjustment.reweigh(&rig, rules, round);
+        if !changed && round >= 2 {
+            break;
+        }
+    }
+    finish(sizes_px, rig, &adjustment)
+}
+
+fn check(sizes_px: &[[u32; 2]], views: &[BoardView]) -> Result<(), CalibrationError> {
+    for (n, view) in views.iter().enumerate() {
+        let bad = |reason: String| CalibrationError::View { view: n, reason };
+        if view.len() != sizes_px.len() || !(1..=2).contains(&sizes_px.len()) {
+            return Err(bad(format!(
+                "{} lists of corners for {} cameras, expected one list each for one or two",
+                view.len(),
+                sizes_px.len()
+            )));
+        }
+        for points in view {
+            if !points.is_empty() && points.len() < MIN_CORNERS {
+                return Err(bad(format!(
+                    "{} corners, expected none or at least {MIN_CORNERS}",
+                    points.len()
+                )));
+            }
+            let finite = |p: &BoardPoint| {
+                (p.board_m.x + p.board_m.y + p.pixel_px.x + p.pixel_px.y).is_finite()
+            };
+            if !points.iter().all(finite) {
+                return Err(bad("a corner is not finite".into()));
+            }
+        }
+    }
+    for camera in 0..sizes_px.len() {
+        let found = views.iter().filter(|v| !v[camera].is_empty()).count();
+        if found < MIN_VIEWS {
+            return Err(CalibrationError::TooFewViews {
+                camera,
+                found,
+                expected: MIN_VIEWS,
+            });
+        }
+    }
+    let common = |v: &BoardView| v.iter().all(|points| !points.is_empty());
+    if !views.iter().any(common) {
+        return Err(CalibrationError::NoCommonView);
+    }
+    Ok(())
+}
+
+fn finish(
+    sizes_px: &[[u32; 2]],
+    rig: Rig,
+    adjustment: &Adjustment,
+) -> Result<Calibration, CalibrationError> {
+    let names = rig.names();
+    let values = rig.values();
+    let undetermined = |i: usize, sigma: f64| CalibrationError::Undetermined {
+        parameter: names[i].clone(),
+        value: values[i],
+        sigma,
+    };
+    let covariance = adjustment
+        .covariance(&rig)
+        .ok_or_else(|| undetermined(0, f64::INFINITY))?;
+    let mut parameters = Vec::with_capacity(names.len());
+    for (i, (name, value)) in names.iter().zip(&values).enumerate() {
+        let sigma = covariance[(i, i)].sqrt();
+        let loose = name.contains(".f") && !(sigma <= MAX_FOCAL_SIGMA * value);
+        if !sigma.is_finite() || loose {
+            return Err(undetermined(i, sigma));
+        }
+        parameters.push(Parameter {
+            name: name.clone(),
+            value: *value,
+            sigma,
+        });
+    }
+    let cameras = rig.cameras(sizes_px);
+    for camera in &cameras {
+        camera.validate()?;
+    }
+    let residuals = adjustment.residuals(&rig);
+    let rms_px = (0..cameras.len())
+        .map(|camera| {
+            let used = residuals.iter().filter(|r| r.camera == camera && r.used);
+            let (sum, n) = used.fold((0.0, 0), |(sum, n), r| {
+                (sum + r.error_px.norm_squared(), n + 1)
+            });
+            (sum / f64::from(n.max(1))).sqrt()
+        })
+        .collect();
+    Ok(Calibration {
+        cameras,
+        parameters,
+        covariance,
+        camera_from_board: rig.camera_from_board,
+        rejected: residuals.iter().filter(|r| !r.used).count(),
+        residuals,
+        rms_px,
+        sigma_px: adjustment.sigma_px(),
+    })
+}

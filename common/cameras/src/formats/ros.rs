@@ -1,0 +1,257 @@
+//! ROS `CameraInfo` as YAML: the calibration files of `camera_calibration_parsers`, and the message
+//! itself as `ros2 topic echo` prints it.
+//!
+//! `R` and `P` describe the rectified image and are not used; the file holds no pose, so the model
+//! is in the camera's own axes (x right, y down, z forward; `camera_optical` unless the message
+//! names its frame).
+
+use super::lens::{Lens, LensCamera};
+use super::yaml::{self, all_finite, list, number, wrong};
+use super::{FormatError, shown};
+use nalgebra::Isometry3;
+use serde::Deserialize;
+use std::fmt::Write;
+
+/// What a file holds.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CameraInfo {
+    /// The camera, in its own axes.
+    pub camera: LensCamera,
+    /// `camera_name`, or the frame of the message's header.
+    pub name: Option<String>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    #[serde(alias = "width")]
+    image_width: u32,
+    #[serde(alias = "height")]
+    image_height: u32,
+    #[serde(default)]
+    camera_name: Option<String>,
+    #[serde(default)]
+    header: Option<Header>,
+    #[serde(alias = "K", alias = "k")]
+    camera_matrix: Matrix,
+    #[serde(alias = "camera_model")]
+    distortion_model: String,
+    #[serde(alias = "D", alias = "d")]
+    distortion_coefficients: Matrix,
+    #[serde(default, alias = "R", alias = "r")]
+    rectification_matrix: Option<Matrix>,
+    #[serde(default, alias = "P", alias = "p")]
+    projection_matrix: Option<Matrix>,
+    #[serde(default)]
+    binning_x: u32,
+    #[serde(default)]
+    binning_y: u32,
+    #[serde(default)]
+    roi: Option<Roi>,
+}
+
+#[derive(Deserialize)]
+struct Header {
+    #[serde(default)]
+    frame_id: Option<String>,
+}
+
+#[derive(Deserialize, PartialEq)]
+struct Roi {
+    #[serde(default)]
+    x_offset: u32,
+    #[serde(default)]
+    y_offset: u32,
+    #[serde(default)]
+    width: u32,
+    #[serde(default)]
+    height: u32,
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Matrix {
+    List(Vec<f64>),
+    Shaped {
+        #[serde(default)]
+        rows: Option<usize>,
+        #[serde(default)]
+        cols: Option<usize>,
+        data: Vec<f64>,
+    },
+}
+
+impl Matrix {
+    /// The numbers, if they are as many as the shape says and as `expected` allows.
+    fn numbers(&self, field: &str, expected: &[usize]) -> Result<&[f64], FormatError> {
+        let (data, shape) = match self {
+            Self::List(data) => (data, None),
+            Self::Shaped { rows, cols, data } => (data, rows.zip(*cols)),
+        };
+        if let Some((rows, cols)) = shape
+            && rows.checked_mul(cols) != Some(data.len())
+        {
+            return Err(wrong(
+                field,
+                format_args!("{} numbers", data.len()),
+                format!("{rows} x {cols} numbers"),
+            ));
+        }
+        if !expected.contains(&data.len()) {
+            return Err(wrong(
+                field,
+                format_args!("{} numbers", data.len()),
+                format!("{expected:?} numbers"),
+            ));
+        }
+        all_finite(field, data)?;
+        Ok(data)
+    }
+}
+
+/// Focal lengths and centre of a 3 x 3 camera matrix, row by row.
+pub(super) fn pinhole(field: &str, k: &[f64]) -> Result<([f64; 2], [f64; 2]), FormatError> {
+    let zeros = [k[1], k[3], k[6], k[7]];
+    if zeros.iter().any(|x| *x != 0.0) || k[8] != 1.0 {
+        return Err(wrong(
+            field,
+            format_args!("{k:?}"),
+            "[fx, 0, cx, 0, fy, cy, 0, 0, 1] (no skew)",
+        ));
+    }
+    Ok(([k[0], k[4]], [k[2], k[5]]))
+}
+
+/// The coefficients k1, k2, p1, p2, k3, ... in the order of OpenCV.
+pub(super) fn polynomial(d: &[f64]) -> Lens {
+    let at = |i: usize| d.get(i).copied().unwrap_or(0.0);
+    Lens::Polynomial {
+        k: [at(0), at(1), at(4), at(5), at(6), at(7)],
+        p: [at(2), at(3)],
+    }
+}
+
+/// Reads a camera.
+///
+/// # Errors
+/// [`FormatError::Structure`] with line and column, [`FormatError::Field`], or
+/// [`FormatError::Camera`].
+pub fn read(text: &str) -> Result<CameraInfo, FormatError> {
+    let file: File = yaml::read(text)?;
+    let k = file.camera_matrix.numbers("camera_matrix", &[9])?;
+    let (focal_px, centre_px) = pinhole("camera_matrix", k)?;
+    let d = |expected: &[usize]| {
+        file.distortion_coefficients
+            .numbers("distortion_coefficients", expected)
+    };
+    let lens = match file.distortion_model.as_str() {
+        "plumb_bob" => polynomial(d(&[0, 4, 5])?),
+        "rational_polynomial" => polynomial(d(&[8])?),
+        "equidistant" | "fisheye" => {
+            let d = d(&[4])?;
+            Lens::Equidistant {
+                k: [d[0], d[1], d[2], d[3]],
+            }
+        }
+        "" | "none" => {
+            d(&[0])?;
+            Lens::NONE
+        }
+        other => {
+            return Err(wrong(
+                "distortion_model",
+                format_args!("{:?}", shown(other)),
+                "plumb_bob, rational_polynomial or equidistant",
+            ));
+        }
+    };
+    if let Some(r) = &file.rectification_matrix {
+        r.numbers("rectification_matrix", &[9])?;
+    }
+    if let Some(p) = &file.projection_matrix {
+        p.numbers("projection_matrix", &[12])?;
+    }
+    if file.binning_x > 1 || file.binning_y > 1 {
+        return Err(wrong(
+            "binning",
+            format_args!("{} x {}", file.binning_x, file.binning_y),
+            "0 or 1: bin the converted model with a downsample instead",
+        ));
+    }
+    if let Some(roi) = &file.roi
+        && (roi.x_offset, roi.y_offset) != (0, 0)
+    {
+        return Err(wrong(
+            "roi",
+            format_args!(
+                "{} x {} from ({}, {})",
+                roi.width, roi.height, roi.x_offset, roi.y_offset
+            ),
+            "no offset: cut the converted model with a subframe instead",
+        ));
+    }
+    let camera = LensCamera {
+        frame_from_camera: Isometry3::identity(),
+        focal_px,
+        centre_px,
+        size_px: [file.image_width, file.image_height],
+        lens,
+    };
+    camera.validate()?;
+    let name = file
+        .camera_name
+        .or_else(|| file.header.and_then(|header| header.frame_id));
+    Ok(CameraInfo { camera, name })
+}
+
+/// Writes the calibration file of a camera. Its pose has no place in it.
+///
+/// # Errors
+/// [`FormatError::Camera`] if the camera is not valid.
+pub fn write(camera: &LensCamera, name: &str) -> Result<String, FormatError> {
+    camera.validate()?;
+    let (model, d) = match &camera.lens {
+        Lens::Equidistant { k } => ("equidistant", k.to_vec()),
+        Lens::Polynomial { k, p } if k[3..] == [0.0; 3] => {
+            ("plumb_bob", vec![k[0], k[1], p[0], p[1], k[2]])
+        }
+        Lens::Polynomial { k, p } => (
+            "rational_polynomial",
+            vec![k[0], k[1], p[0], p[1], k[2], k[3], k[4], k[5]],
+        ),
+    };
+    let ([fx, fy], [cx, cy]) = (camera.focal_px, camera.centre_px);
+    let mut text = String::new();
+    // Writing to a String cannot fail.
+    let _ = write!(
+        text,
+        "image_width: {}\nimage_height: {}\ncamera_name: {}\n\
+         camera_matrix:\n  rows: 3\n  cols: 3\n  data: {}\n\
+         distortion_model: {model}\n\
+         distortion_coefficients:\n  rows: 1\n  cols: {}\n  data: {}\n\
+         rectification_matrix:\n  rows: 3\n  cols: 3\n  data: {}\n\
+         projection_matrix:\n  rows: 3\n  cols: 4\n  data: [{}, 0.0, {}, 0.0, 0.0, {}, {}, 0.0, \
+         0.0, 0.0, 1.0, 0.0]\n",
+        camera.size_px[0],
+        camera.size_px[1],
+        quoted(name),
+        list(&[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        d.len(),
+        list(&d),
+        list(&[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
+        number(fx),
+        number(cx),
+        number(fy),
+        number(cy),
+    );
+    Ok(text)
+}
+
+/// A name in double quotes, reduced to printable ASCII.
+fn quoted(name: &str) -> String {
+    let plain: String = shown(name)
+        .chars()
+        .filter(|c| (' '..='~').contains(c) && !"\"\\".contains(*c))
+        .collect();
+    format!("\"{plain}\"")
+}

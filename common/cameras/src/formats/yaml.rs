@@ -1,0 +1,68 @@
+//! Bounded reading of YAML, and numbers that every YAML reader takes for numbers.
+
+use super::{FormatError, MAX_BYTES, brief};
+use serde::de::DeserializeOwned;
+
+/// Deepest nesting that is read; the deepest of the formats has five levels.
+const MAX_DEPTH: usize = 12;
+
+/// Reads one YAML document. Aliases, which can make a short text long, are refused.
+pub(super) fn read<T: DeserializeOwned>(text: &str) -> Result<T, FormatError> {
+    if text.len() > MAX_BYTES {
+        return Err(FormatError::TooLong { found: text.len() });
+    }
+    let options = serde_saphyr::options! {
+        budget: serde_saphyr::budget! {
+            max_depth: MAX_DEPTH,
+            flow_nesting_limit: MAX_DEPTH,
+            max_aliases: 0,
+            max_anchors: 0,
+            max_merge_keys: 0,
+            max_documents: 1,
+        },
+    };
+    serde_saphyr::from_str_with_options(text, options).map_err(|error| {
+        let bare = error.without_snippet();
+        FormatError::Structure {
+            message: brief(&bare.to_string()),
+        }
+    })
+}
+
+/// A number as YAML 1.1 and 1.2 both read it: with a point, and a sign in the exponent.
+pub(super) fn number(x: f64) -> String {
+    let text = format!("{x:?}");
+    let Some((mantissa, exponent)) = text.split_once('e') else {
+        return text;
+    };
+    let point = if mantissa.contains('.') { "" } else { ".0" };
+    let sign = if exponent.starts_with('-') { "" } else { "+" };
+    format!("{mantissa}{point}e{sign}{exponent}")
+}
+
+/// Numbers as a YAML list.
+pub(super) fn list(numbers: &[f64]) -> String {
+    let words: Vec<String> = numbers.iter().map(|x| number(*x)).collect();
+    format!("[{}]", words.join(", "))
+}
+
+/// Refuses a number that is not finite, naming its field.
+pub(super) fn all_finite(field: &str, numbers: &[f64]) -> Result<(), FormatError> {
+    match numbers.iter().find(|x| !x.is_finite()) {
+        None => Ok(()),
+        Some(x) => Err(wrong(field, x, "finite numbers")),
+    }
+}
+
+/// A field with the wrong content.
+pub(super) fn wrong(
+    field: &str,
+    found: impl std::fmt::Display,
+    expected: impl Into<String>,
+) -> FormatError {
+    FormatError::Field {
+        field: field.to_owned(),
+        found: super::shown(&found.to_string()),
+        expected: expected.into(),
+    }
+}

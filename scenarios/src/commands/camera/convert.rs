@@ -1,0 +1,151 @@
+//! `rover camera convert`: between the formats of model files.
+
+use super::files::{self, Format, express, load};
+use crate::{commands::CommandError, output::Output};
+use rover_cameras::formats::ConversionRules;
+use serde_json::json;
+use std::path::PathBuf;
+
+/// Converts a camera model; what is not exact is fitted and its worst pixel error is printed
+#[derive(Clone, Debug, clap::Args)]
+pub(super) struct ConvertArgs {
+    /// Model to read; `-` is standard input
+    input: PathBuf,
+    /// File to write; `-` is standard output
+    output: PathBuf,
+    /// Format to write (default: by the extension .cahv, .cahvor, .cahvore, .txt or .toml; needed
+    /// for YAML)
+    #[arg(long, value_name = "FORMAT")]
+    to: Option<Format>,
+    /// Largest pixel error that is accepted
+    #[arg(long, value_name = "PX", default_value_t = 0.1)]
+    limit_px: f64,
+    /// Nearest range at which the two shall agree; matters for a lens with a moving pupil
+    #[arg(long, value_name = "M", default_value_t = 0.5)]
+    near_m: f64,
+    /// Image size, if the input does not give it
+    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size)]
+    size: Option<[u32; 2]>,
+    /// Names the frame of the vectors
+    #[arg(long, value_name = "NAME")]
+    frame: Option<String>,
+    /// Cuts out a part of the image: column, row, width, height
+    #[arg(long, value_name = "U,V,W,H", value_parser = four)]
+    subframe: Option<[u32; 4]>,
+    /// Then joins N x N pixels to one
+    #[arg(long, value_name = "N")]
+    downsample: Option<u32>,
+    /// Writes how good the conversion is as JSON
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Overwrites outputs that exist
+    #[arg(long)]
+    force: bool,
+}
+
+fn numbers<const N: usize>(text: &str, by: char) -> Option<[u32; N]> {
+    let all: Option<Vec<u32>> = text.split(by).map(|x| x.trim().parse().ok()).collect();
+    all?.try_into().ok()
+}
+
+fn size(text: &str) -> Result<[u32; 2], String> {
+    numbers(text, 'x')
+        .filter(|s| !s.contains(&0))
+        .ok_or_else(|| "expected WIDTHxHEIGHT in whole pixels, e.g. 640x480".into())
+}
+
+fn four(text: &str) -> Result<[u32; 4], String> {
+    numbers(text, ',').ok_or_else(|| "expected U,V,W,H in whole pixels".into())
+}
+
+/// Runs the verb.
+pub(super) fn run(args: &ConvertArgs) -> Result<(), CommandError> {
+    if !(args.limit_px >= 0.0 && args.near_m > 0.0 && args.near_m.is_finite()) {
+        return Err(CommandError::BadInput(format!(
+            "--limit-px {} --near-m {}: expected numbers above 0",
+            args.limit_px, args.near_m
+        )));
+    }
+    let format = args
+        .to
+        .or_else(|| files::by_extension(&args.output))
+        .ok_or_else(|| {
+            CommandError::BadInput(format!(
+                "{}: its name does not say the format, give --to cahv, toml, ros, opencv or kalibr",
+                args.output.display()
+            ))
+        })?;
+    let output = Output::open(&args.output, args.force)?;
+    let report = args
+        .json
+        .as_deref()
+        .map(|path| Output::open(path, args.force))
+        .transpose()?;
+    let rules = ConversionRules {
+        limit_px: args.limit_px,
+        near_m: args.near_m,
+    };
+    let mut loaded = load(&args.input, &rules)?;
+    if let Some(size) = args.size {
+        if let Some(given) = loaded.file.size_px.filter(|given| *given != size) {
+            return Err(CommandError::BadInput(format!(
+                "--size {}x{}: {} says {} x {} px",
+                size[0], size[1], loaded.name, given[0], given[1]
+            )));
+        }
+        loaded.file.size_px = Some(size);
+    }
+    if args.subframe.is_some() || args.downsample.is_some() {
+        let mut camera = loaded.camera()?;
+        let wrong = |e: rover_cameras::CameraError| CommandError::BadInput(e.to_string());
+        if let Some([u, v, w, h]) = args.subframe {
+            camera = camera.subframe([u, v], [w, h]).map_err(wrong)?;
+        }
+        if let Some(n) = args.downsample {
+            camera = camera.downsampled(n).map_err(wrong)?;
+        }
+        loaded.file.size_px = Some([camera.width_px, camera.height_px]);
+        loaded.file.model = camera.model;
+    }
+    if args.frame.is_some() {
+        loaded.file.frame.clone_from(&args.frame);
+    }
+    let (text, written) = express(&loaded, format, &rules)?;
+    output.write(&text)?;
+    // Errors of reading and of writing add up.
+    let steps: Vec<_> = [loaded.fidelity, written].into_iter().flatten().collect();
+    let exact = steps.iter().all(|f| f.exact);
+    let worst_px: f64 = steps.iter().map(|f| f.worst_px).sum();
+    let covered = steps.iter().map(|f| f.covered).fold(1.0, f64::min);
+    if exact {
+        eprintln!("exact");
+    } else {
+        eprintln!("fitted: {worst_px:.3e} px off at worst");
+    }
+    if covered < 1.0 {
+        eprintln!(
+            "{:.1} % of the image has no ray in the original and was not compared",
+            100.0 * (1.0 - covered)
+        );
+    }
+    let [c, a, ..] = loaded.model().cahv();
+    let posed = matches!(format, Format::Ros | Format::Opencv | Format::Kalibr);
+    if posed {
+        eprintln!(
+            "the pose is not in the file: camera at {} {} {} m, looking along {} {} {}",
+            c.x, c.y, c.z, a.x, a.y, a.z
+        );
+    }
+    if let Some(report) = report {
+        let value = json!({
+            "exact": exact,
+            "worst_px": if exact { 0.0 } else { worst_px },
+            "covered": covered,
+            "pose_dropped": posed,
+            "from": format!("{:?}", loaded.format).to_lowercase(),
+            "to": format!("{format:?}").to_lowercase(),
+        });
+        report.write(&files::json(&value)?)?;
+    }
+    Ok(())
+}

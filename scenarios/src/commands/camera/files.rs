@@ -1,0 +1,261 @@
+//! Model files in and out, in any of the formats.
+
+use crate::commands::CommandError;
+use anyhow::Context;
+use rover_cameras::{
+    Camera, CameraModel,
+    formats::{
+        Conversion, ConversionRules, Family, FormatError, LensCamera, MAX_BYTES, ModelFile, kalibr,
+        opencv, read_text, read_toml, ros, write_text, write_toml,
+    },
+};
+use std::{
+    fs::File,
+    io::{self, Read},
+    path::Path,
+};
+
+/// The frame of a model that has no pose.
+const OWN_AXES: &str = "camera_optical";
+
+/// The formats of model files.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum Format {
+    /// Plain text, one NAME = x y z line per vector
+    Cahv,
+    /// TOML
+    Toml,
+    /// ROS CameraInfo YAML
+    Ros,
+    /// OpenCV FileStorage YAML
+    Opencv,
+    /// Kalibr camera chain
+    Kalibr,
+}
+
+/// How well a converted model stands for the original.
+#[derive(Clone, Copy, Debug, serde::Serialize)]
+pub(super) struct Fidelity {
+    pub(super) exact: bool,
+    pub(super) worst_px: f64,
+    /// Share of the image in which the original has rays.
+    pub(super) covered: f64,
+}
+
+/// A model that was read, whatever it was written in.
+pub(super) struct Loaded {
+    /// The file's name for messages.
+    pub(super) name: String,
+    pub(super) format: Format,
+    pub(super) file: ModelFile,
+    /// `None` for the formats of the CAHV family itself.
+    pub(super) fidelity: Option<Fidelity>,
+}
+
+impl Loaded {
+    /// The camera with its image size.
+    pub(super) fn camera(&self) -> Result<Camera, CommandError> {
+        self.file.camera().map_err(|e| bad(&self.name, &e))
+    }
+
+    /// The camera, without an image size if the file has none.
+    pub(super) fn model(&self) -> &CameraModel {
+        &self.file.model
+    }
+}
+
+fn bad(name: &str, error: &dyn std::fmt::Display) -> CommandError {
+    CommandError::BadInput(format!("{name}: {error}"))
+}
+
+/// Reads a model; one that is not of the CAHV family is converted under `rules`.
+pub(super) fn load(path: &Path, rules: &ConversionRules) -> Result<Loaded, CommandError> {
+    let (path, member) = member(path)?;
+    let (name, text) = text(&path)?;
+    let format = format_of(&path, &text);
+    let fail = |e: FormatError| bad(&name, &e);
+    if member != 0 && format != Format::Kalibr {
+        return Err(bad(&name, &"only a Kalibr chain has a second camera"));
+    }
+    let (file, fidelity) = match format {
+        Format::Cahv => (read_text(&text).map_err(fail)?, None),
+        Format::Toml => (read_toml(&text).map_err(fail)?, None),
+        Format::Ros => {
+            let info = ros::read(&text).map_err(fail)?;
+            let frame = info.name.unwrap_or_else(|| OWN_AXES.into());
+            converted(&name, &info.camera, &frame, rules)?
+        }
+        Format::Opencv => {
+            let camera = opencv::read(&text).map_err(fail)?;
+            converted(&name, &camera, OWN_AXES, rules)?
+        }
+        Format::Kalibr => {
+            let chain = kalibr::read(&text).map_err(fail)?;
+            let camera = chain.get(member).ok_or_else(|| {
+                let n = chain.len();
+                bad(&name, &format!("no camera {member}: the chain has {n}"))
+            })?;
+            converted(&name, camera, "cam0", rules)?
+        }
+    };
+    Ok(Loaded {
+        name,
+        format,
+        file,
+        fidelity,
+    })
+}
+
+fn converted(
+    name: &str,
+    camera: &LensCamera,
+    frame: &str,
+    rules: &ConversionRules,
+) -> Result<(ModelFile, Option<Fidelity>), CommandError> {
+    let found = camera.to_camera(rules).map_err(|e| bad(name, &e))?;
+    let fidelity = fidelity(&found);
+    let file = ModelFile {
+        frame: Some(frame.to_owned()),
+        size_px: Some([found.camera.width_px, found.camera.height_px]),
+        model: found.camera.model,
+    };
+    Ok((file, Some(fidelity)))
+}
+
+fn fidelity<T>(found: &Conversion<T>) -> Fidelity {
+    Fidelity {
+        exact: found.exact,
+        worst_px: found.worst_px,
+        covered: found.covered,
+    }
+}
+
+/// `FILE#1` is the second camera of `FILE`.
+fn member(path: &Path) -> Result<(std::path::PathBuf, usize), CommandError> {
+    let whole = path.to_string_lossy();
+    match whole.rsplit_once('#') {
+        Some((file, number)) if !path.exists() => {
+            let n = number
+                .parse()
+                .map_err(|_| bad(&whole, &"expected a camera's number after #, as in FILE#1"))?;
+            Ok((file.into(), n))
+        }
+        _ => Ok((path.into(), 0)),
+    }
+}
+
+/// The text of a file or of standard input, no longer than a model file may be.
+fn text(path: &Path) -> Result<(String, String), CommandError> {
+    let name = if path == Path::new("-") {
+        "standard input".to_owned()
+    } else {
+        path.display().to_string()
+    };
+    let mut bytes = Vec::new();
+    let limit = MAX_BYTES as u64 + 1;
+    let read = if path == Path::new("-") {
+        io::stdin().lock().take(limit).read_to_end(&mut bytes)
+    } else {
+        File::open(path).and_then(|file| file.take(limit).read_to_end(&mut bytes))
+    };
+    read.map_err(|e| bad(&name, &e))?;
+    if bytes.len() > MAX_BYTES {
+        let found = format!("longer than the {MAX_BYTES} bytes of a model file");
+        return Err(bad(&name, &found));
+    }
+    let text = String::from_utf8(bytes).map_err(|e| {
+        let line = 1 + e.as_bytes()[..e.utf8_error().valid_up_to()]
+            .iter()
+            .filter(|b| **b == b'\n')
+            .count();
+        bad(&name, &format!("line {line}: not UTF-8 text"))
+    })?;
+    Ok((name, text))
+}
+
+/// The format of a text, by the file's extension and, for YAML and standard input, by content.
+fn format_of(path: &Path, text: &str) -> Format {
+    match by_extension(path) {
+        Some(Format::Toml) => return Format::Toml,
+        Some(format) => return format,
+        None => {}
+    }
+    if opencv::is_opencv(text) {
+        return Format::Opencv;
+    }
+    if kalibr::is_kalibr(text) {
+        return Format::Kalibr;
+    }
+    let has = |start: &str| {
+        text.lines()
+            .any(|line| line.trim_start().starts_with(start))
+    };
+    if has("[model") {
+        Format::Toml
+    } else if has("image_width:") || has("distortion_model:") || is_yaml(path) {
+        Format::Ros
+    } else {
+        Format::Cahv
+    }
+}
+
+fn extension(path: &Path) -> String {
+    path.extension()
+        .map(|e| e.to_string_lossy().to_lowercase())
+        .unwrap_or_default()
+}
+
+fn is_yaml(path: &Path) -> bool {
+    matches!(extension(path).as_str(), "yaml" | "yml")
+}
+
+/// The format that an extension alone stands for.
+pub(super) fn by_extension(path: &Path) -> Option<Format> {
+    match extension(path).as_str() {
+        "toml" => Some(Format::Toml),
+        "cahv" | "cahvor" | "cahvore" | "txt" => Some(Format::Cahv),
+        _ => None,
+    }
+}
+
+/// The text of a model in a format, and how well it stands for it.
+pub(super) fn express(
+    loaded: &Loaded,
+    format: Format,
+    rules: &ConversionRules,
+) -> Result<(String, Option<Fidelity>), CommandError> {
+    let fail = |e: FormatError| bad(&loaded.name, &e);
+    let frame = loaded.file.frame.as_deref();
+    let as_lens = |families: &[Family]| -> Result<_, CommandError> {
+        let found = LensCamera::from_camera(&loaded.camera()?, families, rules)
+            .map_err(|e| bad(&loaded.name, &e))?;
+        let fidelity = fidelity(&found);
+        Ok((found.camera, Some(fidelity)))
+    };
+    let all = [Family::PlumbBob, Family::Rational, Family::Equidistant];
+    Ok(match format {
+        Format::Cahv => (write_text(&loaded.camera()?, frame).map_err(fail)?, None),
+        Format::Toml => (write_toml(&loaded.file).map_err(fail)?, None),
+        Format::Ros => {
+            let (camera, fidelity) = as_lens(&all)?;
+            let name = frame.unwrap_or("camera");
+            (ros::write(&camera, name).map_err(fail)?, fidelity)
+        }
+        Format::Opencv => {
+            let (camera, fidelity) = as_lens(&all)?;
+            (opencv::write(&camera).map_err(fail)?, fidelity)
+        }
+        Format::Kalibr => {
+            let families = [Family::RadialTangential, Family::Equidistant];
+            let (camera, fidelity) = as_lens(&families)?;
+            (kalibr::write(&[camera]).map_err(fail)?, fidelity)
+        }
+    })
+}
+
+/// JSON as the reporting commands write it.
+pub(super) fn json(value: &impl serde::Serialize) -> Result<String, CommandError> {
+    let mut text = serde_json::to_string_pretty(value).context("report as JSON")?;
+    text.push('\n');
+    Ok(text)
+}

@@ -1,0 +1,185 @@
+//! `rover camera project | ray | triangulate`: tables of points and pixels.
+
+use super::files::{Loaded, load};
+use crate::{
+    commands::CommandError,
+    tables::{Table, TableWriter},
+};
+use nalgebra::{Vector2, Vector3};
+use rover_cameras::{Camera, CameraError, closest_point, formats::ConversionRules};
+use std::path::PathBuf;
+
+/// Where a table goes.
+#[derive(Clone, Debug, clap::Args)]
+struct OutArgs {
+    /// Writes the table to this file; `-` is standard output
+    #[arg(long, value_name = "FILE", default_value = "-")]
+    out: PathBuf,
+    /// Overwrites outputs that exist
+    #[arg(long)]
+    force: bool,
+}
+
+/// Projects points (x_m,y_m,z_m in the model's frame) to pixels: u_px,v_px,range_m,status
+#[derive(Clone, Debug, clap::Args)]
+pub(super) struct ProjectArgs {
+    /// Camera model
+    model: PathBuf,
+    /// Points: x_m,y_m,z_m
+    points: PathBuf,
+    /// Also gives pixels that lie outside the image
+    #[arg(long)]
+    beyond_image: bool,
+    #[command(flatten)]
+    out: OutArgs,
+}
+
+/// Gives the rays of pixels (u_px,v_px): origin and unit direction in the model's frame
+#[derive(Clone, Debug, clap::Args)]
+pub(super) struct RayArgs {
+    /// Camera model
+    model: PathBuf,
+    /// Pixels: u_px,v_px
+    pixels: PathBuf,
+    #[command(flatten)]
+    out: OutArgs,
+}
+
+/// Triangulates matches (ul_px,vl_px,ur_px,vr_px): x_m,y_m,z_m,miss_m,status
+#[derive(Clone, Debug, clap::Args)]
+pub(super) struct TriangulateArgs {
+    /// Left camera model
+    left: PathBuf,
+    /// Right camera model, in the same frame
+    right: PathBuf,
+    /// Matches: ul_px,vl_px,ur_px,vr_px
+    matches: PathBuf,
+    #[command(flatten)]
+    out: OutArgs,
+}
+
+/// A model whose conversion, if any, is reported.
+fn model(path: &std::path::Path) -> Result<Loaded, CommandError> {
+    let loaded = load(path, &ConversionRules::default())?;
+    if let Some(fidelity) = loaded.fidelity.filter(|f| !f.exact) {
+        eprintln!(
+            "{}: its lens was fitted, {:.2e} px off at worst",
+            loaded.name, fidelity.worst_px
+        );
+    }
+    Ok(loaded)
+}
+
+/// Answers every row of a table.
+fn answer_all<const N: usize, const M: usize>(
+    input: &std::path::Path,
+    out: &OutArgs,
+    columns: (&[&str; N], &[&str; M]),
+    answer: impl Fn([f64; N]) -> Result<[f64; M], String>,
+) -> Result<(), CommandError> {
+    let table = Table::open(input, columns.0)?;
+    let mut writer = TableWriter::create(&out.out, out.force, columns.1)?;
+    for row in table {
+        writer.answer(row?.array().and_then(&answer))?;
+        if writer.is_closed() {
+            break;
+        }
+    }
+    let (_, refused) = writer.counts();
+    writer.finish()?;
+    if refused > 0 {
+        eprintln!("{refused} rows have no answer; the column status says why");
+    }
+    Ok(())
+}
+
+/// `rover camera project`.
+pub(super) fn project(args: &ProjectArgs) -> Result<(), CommandError> {
+    let loaded = model(&args.model)?;
+    let camera = loaded.camera().ok();
+    let project = |[x, y, z]: [f64; 3]| -> Result<[f64; 3], CameraError> {
+        let image = loaded
+            .model()
+            .project_with_jacobian(&Vector3::new(x, y, z))?;
+        if let Some(Camera {
+            width_px,
+            height_px,
+            ..
+        }) = camera
+            && !args.beyond_image
+            && !camera
+                .as_ref()
+                .is_some_and(|c| c.contains(&image.pixel_px, 0.0))
+        {
+            return Err(CameraError::OutsideImage {
+                pixel_px: image.pixel_px,
+                width_px,
+                height_px,
+                margin_px: 0.0,
+            });
+        }
+        Ok([image.pixel_px.x, image.pixel_px.y, image.range_m])
+    };
+    answer_all(
+        &args.points,
+        &args.out,
+        (&["x_m", "y_m", "z_m"], &["u_px", "v_px", "range_m"]),
+        |point| project(point).map_err(|e| e.to_string()),
+    )
+}
+
+/// `rover camera ray`.
+pub(super) fn ray(args: &RayArgs) -> Result<(), CommandError> {
+    let loaded = model(&args.model)?;
+    answer_all(
+        &args.pixels,
+        &args.out,
+        (
+            &["u_px", "v_px"],
+            &["ox_m", "oy_m", "oz_m", "dx", "dy", "dz"],
+        ),
+        |[u, v]| {
+            let ray = loaded
+                .model()
+                .ray(&Vector2::new(u, v))
+                .map_err(|e| e.to_string())?;
+            let (o, d) = (ray.origin, ray.direction);
+            Ok([o.x, o.y, o.z, d.x, d.y, d.z])
+        },
+    )
+}
+
+/// `rover camera triangulate`.
+pub(super) fn triangulate(args: &TriangulateArgs) -> Result<(), CommandError> {
+    let (left, right) = (model(&args.left)?, model(&args.right)?);
+    if let (Some(l), Some(r)) = (&left.file.frame, &right.file.frame)
+        && l != r
+    {
+        return Err(CommandError::BadInput(format!(
+            "{} is given in the frame `{l}`, {} in `{r}`: expected one frame",
+            left.name, right.name
+        )));
+    }
+    answer_all(
+        &args.matches,
+        &args.out,
+        (
+            &["ul_px", "vl_px", "ur_px", "vr_px"],
+            &["x_m", "y_m", "z_m", "miss_m"],
+        ),
+        |[ul, vl, ur, vr]| {
+            let side = |name: &'static str| move |e: CameraError| format!("{name}: {e}");
+            let first = left
+                .model()
+                .ray(&Vector2::new(ul, vl))
+                .map_err(side("left"))?;
+            let second = right
+                .model()
+                .ray(&Vector2::new(ur, vr))
+                .map_err(side("right"))?;
+            let found = closest_point(&first, &second).map_err(|e| e.to_string())?;
+            let p = found.point;
+            Ok([p.x, p.y, p.z, found.miss_m])
+        },
+    )
+}
