@@ -5,6 +5,7 @@
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
 pub mod fiducial;
+pub mod find;
 pub mod harris;
 pub mod image;
 pub mod ncc;
@@ -17,7 +18,7 @@ mod synthetic;
 
 pub use fiducial::{
     DetectionRules, NotFound, PlateObservation, PlatePose, PlateSearch, PointFault, PointKind,
-    PointObservation, estimate_plate_pose, find_plate, find_saddle,
+    PointObservation, estimate_plate_pose, estimate_plate_pose_single, find_plate, find_saddle,
 };
 pub use image::{Image8, ImageError, ImageF, encode_png};
 pub use plate::{Disc, LayoutError, PlateLayout, Saddle};
