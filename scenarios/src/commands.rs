@@ -13,6 +13,7 @@ use crate::{
     placement::{Abort, RUNNER},
     report::ReportError,
     scenario::ScenarioError,
+    tables::TableError,
 };
 use rover_messages::Fault;
 use std::process::ExitCode;
@@ -95,6 +96,16 @@ impl From<OutputError> for CommandError {
         match error {
             OutputError::Exists { .. } => Self::BadInput(error.to_string()),
             OutputError::File { .. } => Self::Internal(error.into()),
+        }
+    }
+}
+
+impl From<TableError> for CommandError {
+    fn from(error: TableError) -> Self {
+        if error.is_bad_input() {
+            Self::BadInput(error.to_string())
+        } else {
+            Self::Internal(error.into())
         }
     }
 }

@@ -9,6 +9,7 @@
 //! | [`placement`] | what happens in which order |
 //! | [`report`] | what did the run come to |
 //! | [`html`] | how does a person see it |
+//! | [`tables`] | how do numbers come in from files and go out again |
 //! | [`registry`] | what is this payload on the network |
 
 pub mod commands;
@@ -22,3 +23,4 @@ pub mod progress;
 pub mod registry;
 pub mod report;
 pub mod scenario;
+pub mod tables;

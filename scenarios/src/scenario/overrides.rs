@@ -1,6 +1,7 @@
 //! `--set PATH=VALUE`: one field of a scenario replaced by a TOML value.
 
 use super::{Scenario, ScenarioError};
+use crate::tables::distance;
 use toml::{Table, Value};
 
 /// The scenario with one field replaced. `PATH` is dotted, an index counts from 0
@@ -134,36 +135,9 @@ fn collect(value: &Value, path: &str, into: &mut Vec<String>) {
     }
 }
 
-/// Levenshtein distance in characters.
-fn distance(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, ca) in a.chars().enumerate() {
-        let mut diagonal = row[0];
-        row[0] = i + 1;
-        for (j, &cb) in b.iter().enumerate() {
-            let substituted = diagonal + usize::from(ca != cb);
-            diagonal = row[j + 1];
-            row[j + 1] = substituted.min(diagonal + 1).min(row[j] + 1);
-        }
-    }
-    row[b.len()]
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn distance_counts_edits() {
-        for (a, b, d) in [
-            ("", "abc", 3),
-            ("kitten", "sitting", 3),
-            ("same", "same", 0),
-        ] {
-            assert_eq!(distance(a, b), d);
-        }
-    }
 
     #[test]
     fn values_are_toml_and_bare_words_are_text() {
