@@ -5,6 +5,7 @@ pub mod inspect;
 pub mod run;
 pub mod service;
 pub mod up;
+pub mod vision;
 
 use crate::{
     html::PageError,

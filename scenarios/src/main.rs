@@ -1,7 +1,7 @@
 //! The `rover` command.
 
 use clap::{Parser, Subcommand};
-use rover::commands::{CommandError, Exit, doctor, inspect, run, service, up};
+use rover::commands::{CommandError, Exit, doctor, inspect, run, service, up, vision};
 use std::process::ExitCode;
 use tracing_subscriber::EnvFilter;
 
@@ -22,6 +22,7 @@ enum Command {
     Up(up::UpArgs),
     Service(service::ServiceArgs),
     Inspect(inspect::InspectArgs),
+    Vision(vision::VisionArgs),
     Doctor(doctor::DoctorArgs),
 }
 
@@ -61,6 +62,7 @@ async fn execute(command: Command) -> Result<Exit, CommandError> {
         Command::Up(args) => up::run(args).await,
         Command::Service(args) => service::run(args).await,
         Command::Inspect(args) => inspect::run(args).await,
+        Command::Vision(args) => vision::run(args).await,
         Command::Doctor(args) => doctor::run(args).await,
     }
 }

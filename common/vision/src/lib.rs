@@ -15,6 +15,11 @@ pub mod stereo;
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod synthetic;
+pub mod texture;
+
+// the reference renderer is shared with the benches, which see this crate from outside
+#[cfg(test)]
+extern crate self as rover_vision;
 
 pub use fiducial::{
     DetectionRules, NotFound, PlateObservation, PlatePose, PlateSearch, PointFault, PointKind,
@@ -23,6 +28,7 @@ pub use fiducial::{
 pub use image::{Image8, ImageError, ImageF, encode_png};
 pub use plate::{Disc, LayoutError, PlateLayout, Saddle};
 pub use stereo::{
-    MatchFailure, MatchRules, PreparedImage, StereoMatch, Surface, SurfaceFailure, SurfaceRules,
-    match_point, measure_surface, sparse_points,
+    DenseError, DenseRules, Disparity, MatchFailure, MatchRules, PreparedImage, Rectifier,
+    RectifyError, StereoMatch, Surface, SurfaceFailure, SurfaceRules, dense_disparity, match_point,
+    measure_surface, sparse_points,
 };

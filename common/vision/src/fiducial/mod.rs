@@ -20,8 +20,8 @@ use crate::image::Image8;
 use crate::plate::PlateLayout;
 
 pub use mark::PointFault;
-pub use pose::{PlatePose, estimate_plate_pose, estimate_plate_pose_single};
 pub(crate) use model::normal_at;
+pub use pose::{PlatePose, estimate_plate_pose, estimate_plate_pose_single};
 pub(crate) use pose::{Sighting, solve_pose};
 pub use rules::DetectionRules;
 

@@ -209,9 +209,7 @@ fn sightings(
                 layout.point_count()
             ))
         })?;
-        if !(p.sigma_px > 0.0
-            && p.sigma_px.is_finite()
-            && p.pixel_px.iter().all(|x| x.is_finite()))
+        if !(p.sigma_px > 0.0 && p.sigma_px.is_finite() && p.pixel_px.iter().all(|x| x.is_finite()))
         {
             return Err(NotFound::BadInput(format!(
                 "point {} has pixel ({}, {}) and sigma {} px, expected finite numbers and a \

@@ -4,6 +4,8 @@
 //! around it, over the smallest surroundings (24, 48, 96 ... px) that have the asked contrast; so a
 //! disc larger than a tile has no hole and uneven light does no harm.
 
+use nalgebra::Vector2;
+
 use crate::image::Image8;
 use crate::ncc::Window;
 
@@ -77,8 +79,8 @@ impl Level {
     fn around(&self, i: usize, j: usize) -> Range {
         let mut all = Range { low: 255, high: 0 };
         for y in j.saturating_sub(1)..(j + 2).min(self.height) {
-            for r in &self.ranges[y * self.width + i.saturating_sub(1)
-                ..y * self.width + (i + 2).min(self.width)]
+            for r in &self.ranges
+                [y * self.width + i.saturating_sub(1)..y * self.width + (i + 2).min(self.width)]
             {
                 all.low = all.low.min(r.low);
                 all.high = all.high.max(r.high);
@@ -92,7 +94,10 @@ impl Level {
         let mut ranges = vec![Range { low: 255, high: 0 }; width * height];
         for j in 0..self.height {
             for i in 0..self.width {
-                let (r, to) = (self.ranges[j * self.width + i], &mut ranges[j / 2 * width + i / 2]);
+                let (r, to) = (
+                    self.ranges[j * self.width + i],
+                    &mut ranges[j / 2 * width + i / 2],
+                );
                 to.low = to.low.min(r.low);
                 to.high = to.high.max(r.high);
             }
@@ -111,8 +116,8 @@ fn thresholds(image: &Image8, window: Window, contrast: u8) -> (usize, Vec<Optio
     let (width, height) = (w.div_ceil(TILE), h.div_ceil(TILE));
     let mut ranges = vec![Range { low: 255, high: 0 }; width * height];
     for y in 0..h {
-        let row = &image.pixels[(window.top as usize + y) * image.width_px as usize
-            + window.left as usize..][..w];
+        let row = &image.pixels
+            [(window.top as usize + y) * image.width_px as usize + window.left as usize..][..w];
         let out = &mut ranges[y / TILE * width..][..width];
         for (r, tile) in out.iter_mut().zip(row.chunks(TILE)) {
             for &p in tile {
@@ -173,9 +178,8 @@ struct Sums {
     at_border: bool,
 }
 
-/// All regions of a window, from the top.
-pub(super) fn blobs(image: &Image8, window: Window, rules: &BlobRules) -> Vec<Blob> {
-    let window = window.clipped(image);
+/// Runs of a clipped window's pixels beyond the threshold, joined where they touch.
+fn label(image: &Image8, window: Window, rules: &BlobRules) -> Vec<Run> {
     let (w, h) = (window.width as usize, window.height as usize);
     if w == 0 || h == 0 {
         return Vec::new();
@@ -185,8 +189,8 @@ pub(super) fn blobs(image: &Image8, window: Window, rules: &BlobRules) -> Vec<Bl
     let mut beyond = vec![false; w + 1];
     let (mut above, mut above_end) = (0usize, 0usize);
     for y in 0..h {
-        let row = &image.pixels[(window.top as usize + y) * image.width_px as usize
-            + window.left as usize..][..w];
+        let row = &image.pixels
+            [(window.top as usize + y) * image.width_px as usize + window.left as usize..][..w];
         let limits = &thresholds[y / TILE * tiles..][..tiles];
         let tiles_of_row = row.chunks(TILE).zip(beyond.chunks_mut(TILE)).zip(limits);
         for ((pixels, out), limit) in tiles_of_row {
@@ -231,6 +235,14 @@ pub(super) fn blobs(image: &Image8, window: Window, rules: &BlobRules) -> Vec<Bl
         }
         (above, above_end) = (first, runs.len());
     }
+    runs
+}
+
+/// All regions of a window, from the top.
+pub(super) fn blobs(image: &Image8, window: Window, rules: &BlobRules) -> Vec<Blob> {
+    let window = window.clipped(image);
+    let (w, h) = (window.width as usize, window.height as usize);
+    let mut runs = label(image, window, rules);
     let mut sums: Vec<Sums> = vec![Sums::default(); runs.len()];
     for i in 0..runs.len() {
         let r = root(&mut runs, i as u32) as usize;
@@ -257,10 +269,7 @@ pub(super) fn blobs(image: &Image8, window: Window, rules: &BlobRules) -> Vec<Bl
             let n = s.n as f64;
             let (mu, mv) = (s.u as f64 / n, s.v as f64 / n);
             Blob {
-                centre: [
-                    mu + f64::from(window.left),
-                    mv + f64::from(window.top),
-                ],
+                centre: [mu + f64::from(window.left), mv + f64::from(window.top)],
                 area: n,
 
                 moments: [
@@ -272,4 +281,63 @@ pub(super) fn blobs(image: &Image8, window: Window, rules: &BlobRules) -> Vec<Bl
             }
         })
         .collect()
+}
+
+/// The outlines of all regions: first and last pixel of every row that a region has, by row.
+/// Regions that touch the window's border are left out.
+pub(super) fn outlines(
+    image: &Image8,
+    window: Window,
+    rules: &BlobRules,
+) -> Vec<Vec<Vector2<f64>>> {
+    let window = window.clipped(image);
+    let mut runs = label(image, window, rules);
+    let mut sizes = vec![0u32; runs.len()];
+    for i in 0..runs.len() {
+        let r = root(&mut runs, i as u32) as usize;
+        let Run {
+            row, start, end, ..
+        } = runs[i];
+        let at_border = start == 0 || row == 0 || end == window.width || row + 1 == window.height;
+        sizes[r] = if at_border {
+            u32::MAX
+        } else {
+            sizes[r].saturating_add(end - start)
+        };
+    }
+    let fits = |size: u32| {
+        size < u32::MAX && f64::from(size) >= rules.area.0 && f64::from(size) <= rules.area.1
+    };
+    let mut places = vec![usize::MAX; runs.len()];
+    let mut all: Vec<Vec<(u32, u32, u32)>> = Vec::new();
+    for i in 0..runs.len() {
+        let r = root(&mut runs, i as u32) as usize;
+        if !fits(sizes[r]) {
+            continue;
+        }
+        if places[r] == usize::MAX {
+            places[r] = all.len();
+            all.push(Vec::new());
+        }
+        let Run {
+            row, start, end, ..
+        } = runs[i];
+        let rows = &mut all[places[r]];
+        match rows.last_mut() {
+            Some(last) if last.0 == row => last.2 = end - 1,
+            _ => rows.push((row, start, end - 1)),
+        }
+    }
+    let at = |u: u32, v: u32| Vector2::new(f64::from(u + window.left), f64::from(v + window.top));
+    let outline = |rows: Vec<(u32, u32, u32)>| {
+        let mut points = Vec::with_capacity(2 * rows.len());
+        for (v, first, last) in rows {
+            points.push(at(first, v));
+            if last > first {
+                points.push(at(last, v));
+            }
+        }
+        points
+    };
+    all.into_iter().map(outline).collect()
 }

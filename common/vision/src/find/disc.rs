@@ -90,7 +90,10 @@ impl DiscRules {
     fn validate(&self) -> Result<(), NoFinding> {
         for (name, x) in [
             ("min_radius_px", self.min_radius_px),
-            ("max_radius_px less min_radius_px", self.max_radius_px - self.min_radius_px),
+            (
+                "max_radius_px less min_radius_px",
+                self.max_radius_px - self.min_radius_px,
+            ),
             ("min_axis_ratio", self.min_axis_ratio),
             ("max_fill_error", self.max_fill_error),
             ("min_contrast_dn", self.min_contrast_dn),
@@ -222,7 +225,11 @@ fn plausible(blob: &Blob, rules: &DiscRules) -> Result<(), NoFinding> {
         })
     };
     let Some((short, long)) = blob.semi_axes() else {
-        return shape("semi-axis in px", 0.0, format!("at least {}", rules.min_radius_px));
+        return shape(
+            "semi-axis in px",
+            0.0,
+            format!("at least {}", rules.min_radius_px),
+        );
     };
     if short < rules.min_radius_px * 0.85 {
         return Err(NoFinding::TooSmall {
@@ -231,7 +238,11 @@ fn plausible(blob: &Blob, rules: &DiscRules) -> Result<(), NoFinding> {
         });
     }
     if long > rules.max_radius_px * 1.1 {
-        return shape("semi-axis in px", long, format!("at most {}", rules.max_radius_px));
+        return shape(
+            "semi-axis in px",
+            long,
+            format!("at most {}", rules.max_radius_px),
+        );
     }
     if short / long < rules.min_axis_ratio {
         return shape(
@@ -243,7 +254,11 @@ fn plausible(blob: &Blob, rules: &DiscRules) -> Result<(), NoFinding> {
     let error = (blob.fill() - 1.0).abs();
     let limit = rules.max_fill_error + 0.35 / short;
     if error > limit {
-        return shape("area beside an ellipse's, as a fraction,", error, format!("at most {limit:.3}"));
+        return shape(
+            "area beside an ellipse's, as a fraction,",
+            error,
+            format!("at most {limit:.3}"),
+        );
     }
     Ok(())
 }
@@ -341,7 +356,11 @@ fn true_centre(
     let axis = truth.camera.ray(&middle).map_err(|e| bad(&e))?;
     let z = axis.direction.into_inner();
     // any frame about the ellipse's ray
-    let other = if z.x.abs() < 0.6 { Vector3::x() } else { Vector3::y() };
+    let other = if z.x.abs() < 0.6 {
+        Vector3::x()
+    } else {
+        Vector3::y()
+    };
     let x = z.cross(&other).normalize();
     let basis = Matrix3::from_columns(&[x, z.cross(&x), z]);
     let mut normal = SMatrix::<f64, 6, 6>::zeros();
@@ -370,19 +389,33 @@ fn true_centre(
         .unwrap_or(0);
     let k = eigen.eigenvectors.column(least);
     let conic = Matrix3::new(
-        k[0], 0.5 * k[1], 0.5 * k[3], 0.5 * k[1], k[2], 0.5 * k[4], 0.5 * k[3], 0.5 * k[4], k[5],
+        k[0],
+        0.5 * k[1],
+        0.5 * k[3],
+        0.5 * k[1],
+        k[2],
+        0.5 * k[4],
+        0.5 * k[3],
+        0.5 * k[4],
+        k[5],
     );
     let scale = Matrix3::from_diagonal(&Vector3::new(1.0 / reach, 1.0 / reach, 1.0));
     let cone = basis * (scale * conic * scale) * basis.transpose();
     let length = truth.normal.norm();
     if !(length.is_finite() && length > 0.0) {
-        return Err(bad(&format!("the normal has length {length}, expected above 0")));
+        return Err(bad(&format!(
+            "the normal has length {length}, expected above 0"
+        )));
     }
     let towards = cone
         .try_inverse()
         .map(|inverse| inverse * (truth.normal / length))
         .ok_or_else(|| bad(&"the ellipse is degenerate"))?;
-    let towards = if towards.dot(&z) < 0.0 { -towards } else { towards };
+    let towards = if towards.dot(&z) < 0.0 {
+        -towards
+    } else {
+        towards
+    };
     let at = truth
         .camera
         .project(&(axis.origin + towards.normalize()))

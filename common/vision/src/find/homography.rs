@@ -1,4 +1,4 @@
-//! A flat fiducial's pose from four or more of its points, without a start.
+//! Flat fiducials: the map of a square, and the pose from four or more points without a start.
 
 use nalgebra::{
     Isometry3, Matrix3, Point3, Rotation3, SMatrix, SVector, SymmetricEigen, Translation3,
@@ -21,7 +21,11 @@ pub(super) fn plane_pose(
     let middle_px = points.iter().map(|(_, q)| q).sum::<Vector2<f64>>() / n;
     let axis = camera.ray(&middle_px).ok()?;
     let z = axis.direction.into_inner();
-    let other = if z.x.abs() < 0.6 { Vector3::x() } else { Vector3::y() };
+    let other = if z.x.abs() < 0.6 {
+        Vector3::x()
+    } else {
+        Vector3::y()
+    };
     let x = z.cross(&other).normalize();
     let basis = Matrix3::from_columns(&[x, z.cross(&x), z]);
     let mut rays = Vec::with_capacity(points.len());
@@ -78,5 +82,29 @@ pub(super) fn plane_pose(
     );
     let shift = Isometry3::translation(-middle_m.x, -middle_m.y, 0.0);
     let pose = at_middle * shift;
-    (pose * Point3::origin()).coords.iter().all(|x| x.is_finite()).then_some(pose)
+    (pose * Point3::origin())
+        .coords
+        .iter()
+        .all(|x| x.is_finite())
+        .then_some(pose)
+}
+
+/// The homography that takes the square (0, 0), (size, 0), (size, size), (0, size) to four corners.
+pub(super) fn square_homography(corners: &[Vector2<f64>; 4], size: f64) -> Option<Matrix3<f64>> {
+    let mut matrix = SMatrix::<f64, 8, 8>::zeros();
+    let mut right = SVector::<f64, 8>::zeros();
+    let square = [(0.0, 0.0), (size, 0.0), (size, size), (0.0, size)];
+    for (k, ((x, y), p)) in square.into_iter().zip(corners).enumerate() {
+        let u = [x, y, 1.0, 0.0, 0.0, 0.0, -p.x * x, -p.x * y];
+        let v = [0.0, 0.0, 0.0, x, y, 1.0, -p.y * x, -p.y * y];
+        for i in 0..8 {
+            matrix[(2 * k, i)] = u[i];
+            matrix[(2 * k + 1, i)] = v[i];
+        }
+        right[2 * k] = p.x;
+        right[2 * k + 1] = p.y;
+    }
+    let h = matrix.lu().solve(&right)?;
+    let map = Matrix3::new(h[0], h[1], h[2], h[3], h[4], h[5], h[6], h[7], 1.0);
+    map.iter().all(|x| x.is_finite()).then_some(map)
 }

@@ -8,10 +8,7 @@
 //! | [`disc`] | a dark or light disc; its true centre with a camera and the disc's normal | nothing |
 //! | [`saddle`] | the crossing of two edges, as in a checker | nothing |
 //! | [`plate`] | the plate of discs and a saddle, and its pose | layout and camera |
-#![cfg_attr(
-    feature = "apriltag",
-    doc = "| [`tags`] | AprilTag families, and their poses | nothing; camera and size for poses |"
-)]
+//! | [`tags`] | AprilTag families, and their poses | nothing; camera and size for poses |
 //!
 //! Every detector refuses by stated rules ([`NoFinding`] names them); none returns its best guess
 //! when nothing is there.
@@ -22,7 +19,7 @@ mod homography;
 mod pixels;
 mod plate;
 mod saddle;
-#[cfg(feature = "apriltag")]
+mod tag_code;
 mod tags;
 mod template;
 #[cfg(test)]
@@ -31,8 +28,8 @@ mod tests;
 pub use disc::{DiscRules, DiscTruth, Polarity, disc};
 pub use plate::plate;
 pub use saddle::{SaddleRules, saddle};
-#[cfg(feature = "apriltag")]
-pub use tags::{TAG_FAMILIES, TagRules, tags};
+pub use tag_code::TAG_FAMILIES;
+pub use tags::{TagRules, tags};
 pub use template::{Appearance, TemplateRules, template, warped_template};
 
 use nalgebra::{Isometry3, Matrix6};

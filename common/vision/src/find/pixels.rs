@@ -168,7 +168,11 @@ pub(super) fn fit_pixels<const N: usize>(
                 score: (1.0 - residual / total.max(1e-9)).max(0.0).sqrt(),
                 rms_dn,
                 sigma_px: rms_dn.max(QUANTISATION_DN) * variance.max(0.0).sqrt() / gain.abs(),
-                saturated: if sums.counted > 0.0 { sums.saturated } else { 0.0 },
+                saturated: if sums.counted > 0.0 {
+                    sums.saturated
+                } else {
+                    0.0
+                },
             });
         }
     }

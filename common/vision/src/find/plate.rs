@@ -39,7 +39,9 @@ pub fn plate(
         return measure(image, camera, layout, pose, radius_px, rules);
     }
     image.validate()?;
-    layout.validate().map_err(|e| NoFinding::BadInput(e.to_string()))?;
+    layout
+        .validate()
+        .map_err(|e| NoFinding::BadInput(e.to_string()))?;
     rules.validate().map_err(NoFinding::BadInput)?;
     if layout.discs.len() < MIN_MATCHES {
         return Err(NoFinding::BadInput(format!(
@@ -179,7 +181,10 @@ impl<'a> Cells<'a> {
     }
 
     fn cell(p: &Vector2<f64>) -> (i32, i32) {
-        ((p.x / CELL_PX).floor() as i32, (p.y / CELL_PX).floor() as i32)
+        (
+            (p.x / CELL_PX).floor() as i32,
+            (p.y / CELL_PX).floor() as i32,
+        )
     }
 
     /// The region closest to a place, within its own short radius times `reach`.
@@ -219,7 +224,11 @@ type Matches = Vec<(usize, usize)>;
 
 /// Poses that explain at least [`MIN_MATCHES`] regions, the best first.
 fn hypotheses(regions: &[Region], camera: &Camera, layout: &PlateLayout) -> Vec<Isometry3<f64>> {
-    let discs: Vec<Vector2<f64>> = layout.discs.iter().map(|d| Vector2::new(d.x_m, d.y_m)).collect();
+    let discs: Vec<Vector2<f64>> = layout
+        .discs
+        .iter()
+        .map(|d| Vector2::new(d.x_m, d.y_m))
+        .collect();
     let centres: Vec<Vector2<f64>> = regions.iter().map(|r| r.centre).collect();
     let (in_layout, in_image) = (nearest(&discs, NEIGHBOURS), nearest(&centres, NEIGHBOURS));
     let cells = Cells::new(regions);
@@ -273,7 +282,11 @@ fn hypotheses(regions: &[Region], camera: &Camera, layout: &PlateLayout) -> Vec<
         }
     }
     poses.sort_by(|a, b| b.0.cmp(&a.0).then(a.1.total_cmp(&b.1)));
-    poses.into_iter().take(MAX_MEASURED).map(|(_, _, pose)| pose).collect()
+    poses
+        .into_iter()
+        .take(MAX_MEASURED)
+        .map(|(_, _, pose)| pose)
+        .collect()
 }
 
 /// Which disc meets which region.

@@ -157,7 +157,11 @@ struct Candidate {
     hessian: [f64; 3],
 }
 
-fn candidates(image: &Image8, window: Window, rules: &SaddleRules) -> Result<Vec<Candidate>, NoFinding> {
+fn candidates(
+    image: &Image8,
+    window: Window,
+    rules: &SaddleRules,
+) -> Result<Vec<Candidate>, NoFinding> {
     let margin = (4.0 * rules.smoothing_px).ceil() as u32 + 2;
     let wide = Window {
         left: window.left.saturating_sub(margin),
@@ -311,7 +315,8 @@ fn fit(image: &Image8, candidate: &Candidate, rules: &SaddleRules) -> Result<Fin
             limit: rules.max_saturated_fraction,
         });
     }
-    let sigma_px = (found.sigma_px * found.sigma_px + rules.sigma_floor_px * rules.sigma_floor_px).sqrt();
+    let sigma_px =
+        (found.sigma_px * found.sigma_px + rules.sigma_floor_px * rules.sigma_floor_px).sqrt();
     if sigma_px > rules.max_sigma_px {
         return Err(NoFinding::Uncertain {
             sigma_px,
@@ -328,7 +333,11 @@ const SAME_PLACE_PX: f64 = 2.0;
 ///
 /// # Errors
 /// [`NoFinding`]: what refused the strongest candidate, or `NothingThere` without a candidate.
-pub fn saddle(image: &Image8, window: Window, rules: &SaddleRules) -> Result<Vec<Finding>, NoFinding> {
+pub fn saddle(
+    image: &Image8,
+    window: Window,
+    rules: &SaddleRules,
+) -> Result<Vec<Finding>, NoFinding> {
     image.validate()?;
     rules.validate()?;
     let mut found: Vec<Finding> = Vec::new();

@@ -434,7 +434,8 @@ fn warp(picture: &Image8, appearance: &Appearance) -> Result<(Patch, Vector2<f64
                 width_m,
             } => {
                 let ray = camera.ray(q).ok()?;
-                let o = camera_frame_from_picture.inverse_transform_point(&Point3::from(ray.origin));
+                let o =
+                    camera_frame_from_picture.inverse_transform_point(&Point3::from(ray.origin));
                 let d = camera_frame_from_picture.inverse_transform_vector(ray.direction.as_ref());
                 if !(o.z > 0.0 && d.z < 0.0) {
                     return None; // the picture's back
@@ -472,7 +473,8 @@ fn warp(picture: &Image8, appearance: &Appearance) -> Result<(Patch, Vector2<f64
     let width = (high.x.ceil() - left) as usize + 1;
     let height = (high.y.ceil() - top) as usize + 1;
     // picture px per image px along each image axis, for the averaging
-    let per_px = |d: Vector2<f64>| -> Option<f64> { Some((back(&(place + d))? - back(&place)?).norm()) };
+    let per_px =
+        |d: Vector2<f64>| -> Option<f64> { Some((back(&(place + d))? - back(&place)?).norm()) };
     let shrink = per_px(Vector2::x())
         .zip(per_px(Vector2::y()))
         .map(|(a, b)| a.max(b))

@@ -48,7 +48,12 @@ pub(super) fn dots_plain(template: &Template, image: &SearchImage, start: usize,
 /// # Safety
 /// For every position `start + i` and every template row, `template.stride` values must follow.
 #[cfg(target_arch = "x86_64")]
-pub(super) unsafe fn dots_sse2(template: &Template, image: &SearchImage, start: usize, out: &mut [i32]) {
+pub(super) unsafe fn dots_sse2(
+    template: &Template,
+    image: &SearchImage,
+    start: usize,
+    out: &mut [i32],
+) {
     use std::arch::x86_64::{
         __m128i, _mm_add_epi32, _mm_cvtsi128_si32, _mm_loadu_si128, _mm_madd_epi16,
         _mm_setzero_si128, _mm_shuffle_epi32,
@@ -80,7 +85,12 @@ pub(super) unsafe fn dots_sse2(template: &Template, image: &SearchImage, start: 
 /// `template.stride` values must follow.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-pub(super) unsafe fn dots_avx2(template: &Template, image: &SearchImage, start: usize, out: &mut [i32]) {
+pub(super) unsafe fn dots_avx2(
+    template: &Template,
+    image: &SearchImage,
+    start: usize,
+    out: &mut [i32],
+) {
     use std::arch::x86_64::{
         __m128i, __m256i, _mm_add_epi32, _mm_cvtsi128_si32, _mm_loadu_si128, _mm_madd_epi16,
         _mm_setzero_si128, _mm_shuffle_epi32, _mm256_add_epi32, _mm256_castsi256_si128,

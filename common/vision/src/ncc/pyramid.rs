@@ -127,11 +127,7 @@ pub fn search_peaks(image: &Image8, template: &TemplatePyramid, window: Window) 
     coarse_to_fine(image, template, window).unwrap_or_default()
 }
 
-fn coarse_to_fine(
-    image: &Image8,
-    template: &TemplatePyramid,
-    window: Window,
-) -> Option<Vec<Peak>> {
+fn coarse_to_fine(image: &Image8, template: &TemplatePyramid, window: Window) -> Option<Vec<Peak>> {
     let window = window.clipped(image);
     let top_level = template.levels.len() - 1;
     let coarse = SearchImage::new(

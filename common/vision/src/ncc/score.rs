@@ -41,10 +41,14 @@ impl ScoreMap {
     /// The best `count` local maxima (of their 3 x 3 neighbourhoods), best first.
     #[must_use]
     pub fn peaks(&self, count: usize) -> Vec<(usize, usize, f32)> {
-        let mut all = Vec::new();
+        // sorted; most places fall short of the last one kept and need no look at their neighbours
+        let mut all: Vec<(usize, usize, f32)> = Vec::with_capacity(count + 1);
         for j in 0..self.height {
             for i in 0..self.width {
                 let s = self.at(i, j);
+                if all.len() == count && all.last().is_none_or(|last| s <= last.2) {
+                    continue;
+                }
                 let rows = j.saturating_sub(1)..=(j + 1).min(self.height - 1);
                 let is_peak = rows.into_iter().all(|y| {
                     (i.saturating_sub(1)..=(i + 1).min(self.width - 1)).all(|x| {
@@ -53,12 +57,12 @@ impl ScoreMap {
                     })
                 });
                 if is_peak {
-                    all.push((i, j, s));
+                    let at = all.partition_point(|kept| kept.2 >= s);
+                    all.insert(at, (i, j, s));
+                    all.truncate(count);
                 }
             }
         }
-        all.sort_by(|a, b| b.2.total_cmp(&a.2).then((a.1, a.0).cmp(&(b.1, b.0))));
-        all.truncate(count);
         all
     }
 

@@ -1,6 +1,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 use super::dots::*;
 use super::*;
+use crate::image::Image8;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
