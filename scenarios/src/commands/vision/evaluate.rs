@@ -112,7 +112,11 @@ pub fn run(args: &EvaluateArgs) -> Result<Exit, CommandError> {
 
 /// Trials of one subject at one noise: half of `patches`, rounded up for the first noise.
 fn evaluate(subject: &Subject, noise_dn: f64, patches: u32, k: usize, stream: u64) -> Row {
-    let share = if k == 0 { patches.div_ceil(2) } else { patches / 2 };
+    let share = if k == 0 {
+        patches.div_ceil(2)
+    } else {
+        patches / 2
+    };
     let outcomes: Vec<Outcome> = (0..share)
         .into_par_iter()
         .map(|i| (subject.trial)(&mut patch::rng(stream, u64::from(i)), noise_dn))

@@ -202,7 +202,11 @@ fn detect(args: &FindArgs, image: &Image8) -> Result<Found, CommandError> {
 }
 
 fn template(args: &FindArgs, image: &Image8, window: Window) -> Result<Found, CommandError> {
-    let path = need(args.template.as_deref(), "--template", "the picture to look for")?;
+    let path = need(
+        args.template.as_deref(),
+        "--template",
+        "the picture to look for",
+    )?;
     let picture = input::image(path)?;
     let rules = input::rules(args.rules.as_deref())?;
     if let Some(pose) = args.pose {
@@ -246,5 +250,6 @@ fn template(args: &FindArgs, image: &Image8, window: Window) -> Result<Found, Co
 
 /// An argument that another one calls for.
 fn need<'a, T: ?Sized>(found: Option<&'a T>, name: &str, why: &str) -> Result<&'a T, CommandError> {
-    found.ok_or_else(|| CommandError::BadInput(format!("{name} is missing, it is needed for {why}")))
+    found
+        .ok_or_else(|| CommandError::BadInput(format!("{name} is missing, it is needed for {why}")))
 }

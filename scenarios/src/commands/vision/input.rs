@@ -48,9 +48,8 @@ pub fn toml_file<T: DeserializeOwned>(path: &Path) -> Result<T, CommandError> {
 /// Reads a camera model. A file without an image size takes that of `image`; another size than the
 /// image's is refused.
 pub fn camera(path: &Path, image: &Image8) -> Result<Camera, CommandError> {
-    let refuse = |e: &dyn std::fmt::Display| {
-        CommandError::BadInput(format!("{}: {e}", path.display()))
-    };
+    let refuse =
+        |e: &dyn std::fmt::Display| CommandError::BadInput(format!("{}: {e}", path.display()));
     let file: formats::ModelFile = if path.extension().is_some_and(|e| e == "toml") {
         toml_file(path)?
     } else {
@@ -83,7 +82,8 @@ pub fn pair(
         left: camera(models.0, images.0)?,
         right: camera(models.1, images.1)?,
     };
-    pair.validate().map_err(|e| CommandError::BadInput(e.to_string()))?;
+    pair.validate()
+        .map_err(|e| CommandError::BadInput(e.to_string()))?;
     Ok(pair)
 }
 

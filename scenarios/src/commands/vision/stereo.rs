@@ -112,9 +112,17 @@ fn matched(loaded: &Loaded, pixel: Vector2<f64>, rules: &MatchRules) -> Result<[
     let seen = pair
         .triangulate(&pixel, &found.right_px)
         .map_err(|e| e.to_string())?;
-    seen.check_miss(&MissLimit::default()).map_err(|e| e.to_string())?;
+    seen.check_miss(&MissLimit::default())
+        .map_err(|e| e.to_string())?;
     let p = seen.point;
-    Ok([found.right_px.x, found.right_px.y, p.x, p.y, p.z, found.score])
+    Ok([
+        found.right_px.x,
+        found.right_px.y,
+        p.x,
+        p.y,
+        p.z,
+        found.score,
+    ])
 }
 
 /// Measures the surface under a left pixel: position, normal, plane rms, points used, roughness

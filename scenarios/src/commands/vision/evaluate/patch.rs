@@ -1,7 +1,9 @@
 //! Rendered patches: a flat thing before a textured ground, seen by a small pinhole camera, with
 //! lens blur, uneven light and grey noise.
 
-use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, Unit, UnitQuaternion, Vector2, Vector3};
+use nalgebra::{
+    Isometry3, Matrix3, Point3, Rotation3, Translation3, Unit, UnitQuaternion, Vector2, Vector3,
+};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rover_cameras::Camera;
@@ -30,11 +32,7 @@ pub fn camera(width: u32, height: u32, position: Vector3<f64>, shift_px: f64) ->
 
 /// A pose within 3 px of the image's middle, at a range of 0.45 to 0.8 m, tilted by up to
 /// `max_tilt_rad` about any axis, turned by up to `max_turn_rad`.
-pub fn pose(
-    rng: &mut ChaCha8Rng,
-    max_tilt_rad: f64,
-    max_turn_rad: f64,
-) -> Isometry3<f64> {
+pub fn pose(rng: &mut ChaCha8Rng, max_tilt_rad: f64, max_turn_rad: f64) -> Isometry3<f64> {
     let range = rng.random_range(0.45..0.8);
     let mut offset = || rng.random_range(-3.0..3.0) / FOCAL_PX;
     let place = Vector3::new(offset(), offset(), 1.0) * range;
@@ -43,7 +41,8 @@ pub fn pose(
     let tilt = rng.random_range(0.0..max_tilt_rad);
     let turn = rng.random_range(-max_turn_rad..=max_turn_rad);
     // x right, y up, z towards the camera
-    let facing = Rotation3::from_matrix_unchecked(Matrix3::from_diagonal(&Vector3::new(1.0, -1.0, -1.0)));
+    let facing =
+        Rotation3::from_matrix_unchecked(Matrix3::from_diagonal(&Vector3::new(1.0, -1.0, -1.0)));
     let rotation = Rotation3::from_axis_angle(&axis, tilt)
         * facing
         * Rotation3::from_axis_angle(&Vector3::z_axis(), turn);
@@ -99,7 +98,11 @@ pub fn draw(
     let [cu, cv] = [intrinsics.hc, intrinsics.vc];
     let origin = pose.inverse_transform_point(&Point3::from(*camera.model.cahv()[0]));
     let turn = pose.rotation.inverse();
-    let (across, down, ahead) = (turn * Vector3::x(), turn * Vector3::y(), turn * Vector3::z());
+    let (across, down, ahead) = (
+        turn * Vector3::x(),
+        turn * Vector3::y(),
+        turn * Vector3::z(),
+    );
     let mut picture = Vec::with_capacity(w * h);
     for v in 0..h {
         for u in 0..w {
@@ -112,9 +115,9 @@ pub fn draw(
                 let d = across * x + down * y + ahead;
                 let t = -origin.z / d.z;
                 let hit = (t > 0.0).then(|| shade(origin.x + t * d.x, origin.y + t * d.y));
-                sum += hit.flatten().unwrap_or_else(|| {
-                    *outside.get_or_insert_with(|| ground(u as f64, v as f64))
-                });
+                sum += hit
+                    .flatten()
+                    .unwrap_or_else(|| *outside.get_or_insert_with(|| ground(u as f64, v as f64)));
             }
             picture.push(sum / (N * N) as f64);
         }
@@ -162,7 +165,10 @@ pub fn expose(
         .iter()
         .enumerate()
         .map(|(i, x)| {
-            let (u, v) = ((i % w) as f64 / w as f64 - 0.5, (i / w) as f64 / h as f64 - 0.5);
+            let (u, v) = (
+                (i % w) as f64 / w as f64 - 0.5,
+                (i / w) as f64 / h as f64 - 0.5,
+            );
             let gain = light.gain * (1.0 + light.slope[0] * u + light.slope[1] * v);
             let grey = gain * x + light.offset_dn + noise_dn * normal(rng);
             grey.round().clamp(0.0, 255.0) as u8
@@ -182,7 +188,11 @@ pub fn blank(width: u32, height: u32, noise_dn: f64, rng: &mut ChaCha8Rng) -> Op
         .map(|i| {
             let (u, v) = (f64::from(i % width), f64::from(i / width));
             let x = texture(u, v, coarsest, finest, contrast, seed >> 1);
-            if hard { 110.0 + (x - 110.0).clamp(-1.0, 1.0) * 80.0 } else { x }
+            if hard {
+                110.0 + (x - 110.0).clamp(-1.0, 1.0) * 80.0
+            } else {
+                x
+            }
         })
         .collect();
     let light = Light::random(rng);

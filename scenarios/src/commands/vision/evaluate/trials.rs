@@ -14,9 +14,7 @@ use rover_vision::find::{
 use rover_vision::harris::HarrisRules;
 use rover_vision::ncc::Window;
 use rover_vision::texture::texture;
-use rover_vision::{
-    DetectionRules, Image8, PlateLayout, PlateSearch, find_plate, find_saddle,
-};
+use rover_vision::{DetectionRules, Image8, PlateLayout, PlateSearch, find_plate, find_saddle};
 
 use super::patch::{self, FOCAL_PX, Light};
 
@@ -194,7 +192,11 @@ fn first(found: Result<Finding, NoFinding>, truth: &Vector2<f64>) -> Outcome {
 /// The corner of a light square, as far as the response's own pull inwards lets it be one.
 fn harris(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
     let shade = |x: f64, y: f64| {
-        (x.abs().max(y.abs()) < 0.03).then_some(if x > 0.0 && y > 0.0 { WHITE_DN } else { BLACK_DN })
+        (x.abs().max(y.abs()) < 0.03).then_some(if x > 0.0 && y > 0.0 {
+            WHITE_DN
+        } else {
+            BLACK_DN
+        })
     };
     let Some((_, image, _, truth)) = scene(rng, noise_dn, SIDE_PX, std::f64::consts::PI, &shade)
     else {
@@ -212,13 +214,19 @@ fn template(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
     let at = |u: f64, v: f64| texture(u, v, 32.0, 4.0, 25.0, seed);
     let mut take = |corner: Vector2<f64>, side: u32| {
         let picture: Vec<f64> = (0..side * side)
-            .map(|i| at(corner.x + f64::from(i % side), corner.y + f64::from(i / side)))
+            .map(|i| {
+                at(
+                    corner.x + f64::from(i % side),
+                    corner.y + f64::from(i / side),
+                )
+            })
             .collect();
         let light = Light::random(rng);
         patch::expose(&picture, side, &light, noise_dn, rng)
     };
     let whole = take(Vector2::zeros(), SIDE_PX);
-    let truth = Vector2::new(47.3, 46.8) + Vector2::new((seed % 97) as f64, (seed % 89) as f64) * 0.1;
+    let truth =
+        Vector2::new(47.3, 46.8) + Vector2::new((seed % 97) as f64, (seed % 89) as f64) * 0.1;
     let picture = take(truth - Vector2::repeat(15.0), 31);
     let (Some(image), Some(picture)) = (whole, picture) else {
         return Outcome::MISSED;
@@ -243,7 +251,10 @@ fn other_picture(rng: &mut ChaCha8Rng, side: u32) -> Option<Image8> {
 }
 
 fn blank_template(rng: &mut ChaCha8Rng, noise_dn: f64) -> bool {
-    let (picture, image) = (other_picture(rng, 31), patch::blank(SIDE_PX, SIDE_PX, noise_dn, rng));
+    let (picture, image) = (
+        other_picture(rng, 31),
+        patch::blank(SIDE_PX, SIDE_PX, noise_dn, rng),
+    );
     picture.zip(image).is_some_and(|(picture, image)| {
         let rules = TemplateRules::default();
         find::template(&image, &picture, Window::whole(&image), &rules).is_ok()
@@ -273,7 +284,8 @@ fn warped(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
     let half = 0.5 * PICTURE_M;
     let at = |i: f64, j: f64| texture(i, j, 50.0, 6.0, 25.0, seed);
     let shade = |x: f64, y: f64| {
-        (x.abs().max(y.abs()) < half).then(|| at((x + half) * per_m - 0.5, (half - y) * per_m - 0.5))
+        (x.abs().max(y.abs()) < half)
+            .then(|| at((x + half) * per_m - 0.5, (half - y) * per_m - 0.5))
     };
     let made = scene(rng, noise_dn, SIDE_PX, std::f64::consts::PI, &shade);
     let pixels = (0..PICTURE_PX * PICTURE_PX)
@@ -317,10 +329,16 @@ fn blank_warped(rng: &mut ChaCha8Rng, noise_dn: f64) -> bool {
 fn disc(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
     let radius = rng.random_range(0.006..0.018);
     let shade = move |x: f64, y: f64| {
-        (x.abs().max(y.abs()) < 1.6 * radius)
-            .then(|| if x.hypot(y) < radius { BLACK_DN } else { WHITE_DN })
+        (x.abs().max(y.abs()) < 1.6 * radius).then(|| {
+            if x.hypot(y) < radius {
+                BLACK_DN
+            } else {
+                WHITE_DN
+            }
+        })
     };
-    let Some((camera, image, pose, truth)) = scene(rng, noise_dn, SIDE_PX, std::f64::consts::PI, &shade)
+    let Some((camera, image, pose, truth)) =
+        scene(rng, noise_dn, SIDE_PX, std::f64::consts::PI, &shade)
     else {
         return Outcome::MISSED;
     };
