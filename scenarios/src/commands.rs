@@ -9,6 +9,7 @@ pub mod run;
 pub mod service;
 pub mod study;
 pub mod up;
+pub mod vision;
 
 use crate::{
     html::PageError,

@@ -1,7 +1,7 @@
 //! The `rover` command.
 
 use clap::{Parser, Subcommand};
-use rover::commands::{CommandError, Exit, arm, camera, campaign, doctor, inspect, run, service, study, up};
+use rover::commands::{CommandError, Exit, arm, camera, campaign, doctor, inspect, run, service, study, up, vision};
 use std::{io::IsTerminal, process::ExitCode};
 use tracing_subscriber::EnvFilter;
 
@@ -25,6 +25,7 @@ enum Command {
     Inspect(inspect::InspectArgs),
     Arm(arm::ArmArgs),
     Camera(camera::CameraArgs),
+    Vision(vision::VisionArgs),
     Doctor(doctor::DoctorArgs),
     Study(study::StudyArgs),
 }
@@ -69,6 +70,7 @@ async fn execute(command: Command) -> Result<Exit, CommandError> {
         Command::Inspect(args) => inspect::run(args).await,
         Command::Arm(args) => arm::run(args),
         Command::Camera(args) => camera::run(args),
+        Command::Vision(args) => vision::run(args).await,
         Command::Doctor(args) => doctor::run(args).await,
         Command::Study(args) => study::run(&args),
     }

@@ -3,6 +3,7 @@
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use nalgebra::{Isometry3, Vector2};
+use rover_vision::find::{self, DiscRules, SaddleRules, TagRules, TemplateRules};
 use rover_vision::ncc::{TemplatePyramid, Window, search};
 use rover_vision::*;
 
@@ -67,6 +68,19 @@ fn fiducial(c: &mut Criterion) {
     c.bench_function("saddle alone, search radius 16 px", |b| {
         b.iter(|| find_saddle(&left, &search).unwrap());
     });
+    c.bench_function("plate, whole image without a prediction", |b| {
+        b.iter(|| find::plate(&left, &pair.left, &layout, None, &rules).unwrap());
+    });
+    let whole = Window::whole(&left);
+    c.bench_function("discs, whole image", |b| {
+        b.iter(|| find::disc(&left, whole, &DiscRules::default(), None).unwrap());
+    });
+    c.bench_function("saddles, whole image", |b| {
+        b.iter(|| find::saddle(&left, whole, &SaddleRules::default()).unwrap());
+    });
+    c.bench_function("tags, whole image", |b| {
+        b.iter(|| find::tags(&left, whole, "tag36h11", None, &TagRules::default()).is_err());
+    });
     let seen = [
         find_plate(&left, &looking(&pair.left, 20.0)).unwrap(),
         find_plate(&right, &looking(&pair.right, 20.0)).unwrap(),
@@ -87,6 +101,15 @@ fn template(c: &mut Criterion) {
     c.bench_function("template 31 x 31, whole image", |b| {
         b.iter(|| search(&image, &template, Window::whole(&image)).unwrap());
     });
+    let picture: Vec<u8> = values.iter().map(|&x| x as u8).collect();
+    let picture = Image8::from_raw(31, 31, picture).unwrap();
+    c.bench_function(
+        "template 31 x 31, whole image, with affine fit and all rules",
+        |b| {
+            let rules = TemplateRules::default();
+            b.iter(|| find::template(&image, &picture, Window::whole(&image), &rules).unwrap());
+        },
+    );
     let window = Window {
         left: 290,
         top: 205,
@@ -105,6 +128,25 @@ fn stereo(c: &mut Criterion) {
     let images = [rock_image(&pose, 0), rock_image(&pose, 1)];
     c.bench_function("prepare one image", |b| {
         b.iter(|| PreparedImage::new(&images[0]).unwrap());
+    });
+    let rectifier = Rectifier::new(&pair, 40.0).unwrap();
+    c.bench_function("rectify one image", |b| {
+        b.iter(|| {
+            rectifier
+                .apply(&images[0], rover_cameras::Side::Left)
+                .unwrap()
+        });
+    });
+    let flat = [
+        rectifier
+            .apply(&images[0], rover_cameras::Side::Left)
+            .unwrap(),
+        rectifier
+            .apply(&images[1], rover_cameras::Side::Right)
+            .unwrap(),
+    ];
+    c.bench_function("dense disparity 640 x 480, 64 disparities", |b| {
+        b.iter(|| dense_disparity(&flat[0], &flat[1], &DenseRules::default()).unwrap());
     });
     let [left, right] = images.map(|i| PreparedImage::new(&i).unwrap());
     let rules = MatchRules {

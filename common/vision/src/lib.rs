@@ -6,6 +6,7 @@
 
 pub mod board;
 pub mod fiducial;
+pub mod find;
 pub mod harris;
 pub mod image;
 pub mod ncc;
@@ -15,14 +16,20 @@ pub mod stereo;
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod synthetic;
+pub mod texture;
+
+// the reference renderer is shared with the benches, which see this crate from outside
+#[cfg(test)]
+extern crate self as rover_vision;
 
 pub use fiducial::{
     DetectionRules, NotFound, PlateObservation, PlatePose, PlateSearch, PointFault, PointKind,
-    PointObservation, estimate_plate_pose, find_plate, find_saddle,
+    PointObservation, estimate_plate_pose, estimate_plate_pose_single, find_plate, find_saddle,
 };
 pub use image::{Image8, ImageError, ImageF, encode_png};
 pub use plate::{Disc, LayoutError, PlateLayout, Saddle};
 pub use stereo::{
-    MatchFailure, MatchRules, PreparedImage, StereoMatch, Surface, SurfaceFailure, SurfaceRules,
-    match_point, measure_surface, sparse_points,
+    DenseError, DenseRules, Disparity, MatchFailure, MatchRules, PreparedImage, Rectifier,
+    RectifyError, StereoMatch, Surface, SurfaceFailure, SurfaceRules, dense_disparity, match_point,
+    measure_surface, sparse_points,
 };

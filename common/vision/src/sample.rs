@@ -57,6 +57,9 @@ fn near_floor(x: f32) -> i32 {
     (x + 1024.0) as i32 - 1024
 }
 
+/// Samples of a grid whose weights are worked out together.
+const CHUNK: usize = 16;
+
 /// Weights of Keys' kernel (a = -1/2) for the pixels at -1, 0, 1, 2 and their derivatives.
 fn keys_weights(t: f32) -> ([f32; 4], [f32; 4]) {
     let (t2, t3) = (t * t, t * t * t);
@@ -213,22 +216,37 @@ impl SplineImage {
         for (j, line) in out.chunks_exact_mut(columns).take(rows).enumerate() {
             let u0 = (origin[0] - base[0] + j as f64 * step_v[0]) as f32;
             let v0 = (origin[1] - base[1] + j as f64 * step_v[1]) as f32;
-            for (i, o) in line.iter_mut().enumerate() {
-                let (u, v) = (u0 + i as f32 * su, v0 + i as f32 * sv);
-                let iu = (near_floor(u) + base_u).clamp(1, max_u);
-                let iv = (near_floor(v) + base_v).clamp(1, max_v);
-                let wu = spline_weights(u - (iu - base_u) as f32);
-                let wv = spline_weights(v - (iv - base_v) as f32);
-                let start = (iv as usize - 1) * width + iu as usize - 1;
-                let mut columns4 = [0.0f32; 4];
-                for (k, weight) in wv.iter().enumerate() {
-                    let row = &values[start + k * width..start + k * width + 4];
-                    for (c, x) in columns4.iter_mut().zip(row) {
-                        *c += weight * x;
+            for (c, chunk) in line.chunks_mut(CHUNK).enumerate() {
+                // indices and weights of a whole chunk in arrays, which the compiler turns into
+                // vectors; then one sample after the other
+                let (mut ius, mut ivs) = ([0i32; CHUNK], [0i32; CHUNK]);
+                let mut wus = [[0.0f32; CHUNK]; 4];
+                let mut wvs = [[0.0f32; CHUNK]; 4];
+                for i in 0..CHUNK {
+                    let k = (c * CHUNK + i) as f32;
+                    let (u, v) = (u0 + k * su, v0 + k * sv);
+                    let iu = (near_floor(u) + base_u).clamp(1, max_u);
+                    let iv = (near_floor(v) + base_v).clamp(1, max_v);
+                    let wu = spline_weights(u - (iu - base_u) as f32);
+                    let wv = spline_weights(v - (iv - base_v) as f32);
+                    (ius[i], ivs[i]) = (iu, iv);
+                    for k in 0..4 {
+                        wus[k][i] = wu[k];
+                        wvs[k][i] = wv[k];
                     }
                 }
-                *o = (columns4[0] * wu[0] + columns4[1] * wu[1])
-                    + (columns4[2] * wu[2] + columns4[3] * wu[3]);
+                for (i, o) in chunk.iter_mut().enumerate() {
+                    let start = (ivs[i] as usize - 1) * width + ius[i] as usize - 1;
+                    let mut columns4 = [0.0f32; 4];
+                    for (k, weights) in wvs.iter().enumerate() {
+                        let row = &values[start + k * width..start + k * width + 4];
+                        for (c, x) in columns4.iter_mut().zip(row) {
+                            *c += weights[i] * x;
+                        }
+                    }
+                    *o = (columns4[0] * wus[0][i] + columns4[1] * wus[1][i])
+                        + (columns4[2] * wus[2][i] + columns4[3] * wus[3][i]);
+                }
             }
         }
         true

@@ -154,6 +154,11 @@ impl Normal {
     }
 }
 
+/// Standard normal distribution function and density at `x`, from the table.
+pub(crate) fn normal_at(x: f32) -> (f32, f32) {
+    normal().at(x)
+}
+
 /// Blurred darkness (0 white, 1 black) at a pixel, its derivatives with respect to the pixel and
 /// to the blur, and the distance from the mark's edge (negative inside).
 #[derive(Clone, Copy, Debug)]

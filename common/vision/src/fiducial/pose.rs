@@ -24,7 +24,7 @@ pub struct PlatePose {
 
 /// One point in one camera.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Sighting {
+pub(crate) struct Sighting {
     pub camera: usize,
     pub index: usize,
     pub point_in_plate: Vector3<f64>,
@@ -33,10 +33,10 @@ pub(super) struct Sighting {
 }
 
 /// A solved pose.
-pub(super) struct Solved {
+pub(crate) struct Solved {
     pub pose: Isometry3<f64>,
     /// J^T W J at the solution.
-    information: Matrix6<f64>,
+    pub information: Matrix6<f64>,
     /// Length of each reprojection error, px.
     residuals_px: Vec<f64>,
     /// Weighted sum of squares.
@@ -53,7 +53,7 @@ impl Solved {
             .max_by(|a, b| a.1.total_cmp(&b.1))
     }
 
-    fn rms_px(&self) -> f64 {
+    pub fn rms_px(&self) -> f64 {
         let sum: f64 = self.residuals_px.iter().map(|r| r * r).sum();
         (sum / (2.0 * self.residuals_px.len().max(1) as f64)).sqrt()
     }
@@ -105,7 +105,7 @@ fn linearise(
 }
 
 /// Minimises the weighted reprojection errors, Levenberg-Marquardt from `start`.
-pub(super) fn solve_pose(
+pub(crate) fn solve_pose(
     cameras: &[&Camera],
     seen: &[Sighting],
     start: &Isometry3<f64>,
@@ -174,41 +174,72 @@ pub fn estimate_plate_pose(
     right: &PlateObservation,
     start: &Isometry3<f64>,
 ) -> Result<PlatePose, NotFound> {
-    let mut seen = Vec::with_capacity(left.points.len() + right.points.len());
-    for (camera, observation) in [left, right].into_iter().enumerate() {
-        for p in &observation.points {
-            let point_in_plate = layout.point(p.index).ok_or_else(|| {
-                NotFound::BadInput(format!(
-                    "an observation has point {}, the layout has {} points",
-                    p.index,
-                    layout.point_count()
-                ))
-            })?;
-            if !(p.sigma_px > 0.0
-                && p.sigma_px.is_finite()
-                && p.pixel_px.iter().all(|x| x.is_finite()))
-            {
-                return Err(NotFound::BadInput(format!(
-                    "point {} has pixel ({}, {}) and sigma {} px, expected finite numbers and a \
-                     positive sigma",
-                    p.index, p.pixel_px.x, p.pixel_px.y, p.sigma_px
-                )));
-            }
-            seen.push(Sighting {
-                camera,
-                index: p.index,
-                point_in_plate,
-                pixel_px: p.pixel_px,
-                sigma_px: p.sigma_px,
-            });
+    let mut seen = sightings(layout, left, 0)?;
+    seen.extend(sightings(layout, right, 1)?);
+    settle(&[&pair.left, &pair.right], seen, start)
+}
+
+/// Six-DoF pose of the plate from its points in one image, in the frame of the camera's vectors
+/// (`rover_from_plate` of the result). By the same rules as [`estimate_plate_pose`]; range comes
+/// from the plate's size alone and is several times less certain than with two images.
+///
+/// # Errors
+/// As [`estimate_plate_pose`].
+pub fn estimate_plate_pose_single(
+    camera: &Camera,
+    layout: &PlateLayout,
+    observation: &PlateObservation,
+    start: &Isometry3<f64>,
+) -> Result<PlatePose, NotFound> {
+    settle(&[camera], sightings(layout, observation, 0)?, start)
+}
+
+/// The points of an observation, checked.
+fn sightings(
+    layout: &PlateLayout,
+    observation: &PlateObservation,
+    camera: usize,
+) -> Result<Vec<Sighting>, NotFound> {
+    let mut seen = Vec::with_capacity(observation.points.len());
+    for p in &observation.points {
+        let point_in_plate = layout.point(p.index).ok_or_else(|| {
+            NotFound::BadInput(format!(
+                "an observation has point {}, the layout has {} points",
+                p.index,
+                layout.point_count()
+            ))
+        })?;
+        if !(p.sigma_px > 0.0 && p.sigma_px.is_finite() && p.pixel_px.iter().all(|x| x.is_finite()))
+        {
+            return Err(NotFound::BadInput(format!(
+                "point {} has pixel ({}, {}) and sigma {} px, expected finite numbers and a \
+                 positive sigma",
+                p.index, p.pixel_px.x, p.pixel_px.y, p.sigma_px
+            )));
         }
+        seen.push(Sighting {
+            camera,
+            index: p.index,
+            point_in_plate,
+            pixel_px: p.pixel_px,
+            sigma_px: p.sigma_px,
+        });
     }
+    Ok(seen)
+}
+
+/// Solves the pose, leaving out what does not fit, the worst first.
+fn settle(
+    cameras: &[&Camera],
+    mut seen: Vec<Sighting>,
+    start: &Isometry3<f64>,
+) -> Result<PlatePose, NotFound> {
     let total = seen.len();
-    let cameras = [&pair.left, &pair.right];
     let mut pose = *start;
     loop {
         let in_camera = |k: usize| seen.iter().filter(|s| s.camera == k).count();
-        let enough = seen.len() >= MIN_POINTS_TOTAL && in_camera(0) >= 2 && in_camera(1) >= 2;
+        let enough =
+            seen.len() >= MIN_POINTS_TOTAL && (0..cameras.len()).all(|k| in_camera(k) >= 2);
         if !enough {
             return Err(NotFound::TooFewPoints {
                 found: seen.len(),
@@ -216,7 +247,7 @@ pub fn estimate_plate_pose(
                 first_fault: None,
             });
         }
-        let solved = solve_pose(&cameras, &seen, &pose)?;
+        let solved = solve_pose(cameras, &seen, &pose)?;
         pose = solved.pose;
         let mut sorted = solved.residuals_px.clone();
         sorted.sort_by(f64::total_cmp);

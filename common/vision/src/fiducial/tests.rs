@@ -305,12 +305,6 @@ fn textured_noise_without_a_plate_is_never_accepted() {
 }
 
 #[test]
-#[ignore = "ten thousand images: minutes, run with --release"]
-fn ten_thousand_images_without_a_plate_give_no_plate() {
-    search_without_a_plate(10_000, 40);
-}
-
-#[test]
 fn a_shadow_edge_or_an_occluder_costs_points_but_not_accuracy() {
     let rig = Rig::new();
     let mut rng = synthetic::rng(5);

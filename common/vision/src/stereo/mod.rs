@@ -7,15 +7,20 @@
 //! ground seen obliquely, is thereby part of the model.
 
 mod coarse;
+mod dense;
 mod link;
 mod matching;
+mod plane_smoothing;
+mod rectify;
 mod refine;
 mod rules;
 mod sparse;
 mod surface;
 mod surface_fit;
 
+pub use dense::{DenseError, DenseRules, Disparity, dense_disparity};
 pub use matching::{MatchFailure, StereoMatch, match_point};
+pub use rectify::{Rectifier, RectifyError};
 pub use rules::{MatchRules, SurfaceRules};
 pub use sparse::sparse_points;
 pub use surface::{Surface, SurfaceFailure, measure_surface};
@@ -69,5 +74,7 @@ impl TryFrom<&Image8> for PreparedImage {
     }
 }
 
+#[cfg(test)]
+mod dense_tests;
 #[cfg(test)]
 mod tests;

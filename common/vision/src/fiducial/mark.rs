@@ -1,0 +1,429 @@
+//! One mark of the plate, by a least-squares fit of its blurred image model.
+//!
+//! Around a point the image is modelled as offset + gain * darkness(pixel - centre; blur). The
+//! darkness comes from the plate's own geometry under the local perspective map, so the fitted
+//! centre is the projection of the mark's centre and not the centroid of its image (the two differ
+//! by up to half a pixel for an oblique disc).
+
+use nalgebra::{SMatrix, SVector, Vector2};
+
+use super::model::{LocalMap, MarkModel};
+use super::{DetectionRules, PointKind};
+use crate::image::Image8;
+use crate::plate::PlateLayout;
+
+/// Why a single point was refused.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub enum PointFault {
+    /// Its window leaves the image.
+    #[error("its window around ({u_px:.1}, {v_px:.1}) leaves the image")]
+    OutsideImage {
+        /// Predicted pixel.
+        u_px: f64,
+        /// Predicted pixel.
+        v_px: f64,
+    },
+    /// Its image is too small to be measured.
+    #[error("its image has a radius of {found_px:.2} px, {needed_px} px are needed")]
+    TooSmall {
+        /// Radius along the shortest direction, px.
+        found_px: f64,
+        /// Least radius, px.
+        needed_px: f64,
+    },
+    /// White and black differ too little, or the wrong way round.
+    #[error("its contrast is {found_dn:.1} DN, {needed_dn} DN are needed")]
+    LowContrast {
+        /// White minus black, DN.
+        found_dn: f64,
+        /// Least contrast, DN.
+        needed_dn: f64,
+    },
+    /// Its contrast differs from that of the other points: a shadow or a reflection covers it.
+    #[error("its contrast is {found_dn:.1} DN where the plate's is {plate_dn:.1} DN")]
+    OtherContrast {
+        /// White minus black at this point, DN.
+        found_dn: f64,
+        /// Median over the plate, DN.
+        plate_dn: f64,
+    },
+    /// The image does not look like the point: shadow edge, reflection, occlusion.
+    #[error("its image differs from the model by {rms_dn:.1} DN rms, limit {limit_dn:.1} DN")]
+    Misfit {
+        /// Root mean square difference, DN.
+        rms_dn: f64,
+        /// Largest accepted difference, DN.
+        limit_dn: f64,
+    },
+    /// White is clipped.
+    #[error("{fraction:.3} of its pixels are saturated, limit {limit}")]
+    Saturated {
+        /// Fraction of saturated pixels.
+        fraction: f64,
+        /// Largest accepted fraction.
+        limit: f64,
+    },
+    /// The fit ran away from the prediction, or did not settle.
+    #[error("its fit moved {moved_px:.2} px from the prediction, limit {limit_px} px")]
+    Diverged {
+        /// Distance from the prediction, px.
+        moved_px: f64,
+        /// Largest accepted distance, px.
+        limit_px: f64,
+    },
+    /// It does not fit the rigid plate that the other points form.
+    #[error("it lies {residual_px:.2} px from its place in the plate's pose, limit {limit_px} px")]
+    OffPose {
+        /// Reprojection error, px.
+        residual_px: f64,
+        /// Largest accepted error, px.
+        limit_px: f64,
+    },
+}
+
+/// A fitted mark.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct MarkFit {
+    pub pixel_px: Vector2<f64>,
+    pub sigma_px: f64,
+    pub contrast_dn: f64,
+    pub blur_px: f64,
+}
+
+const MAX_STEPS: usize = 10;
+/// A fit has settled when its last step was shorter than this, px; what remains is far smaller.
+const SETTLED_PX: f64 = 0.005;
+/// The same for a first fit that only serves to find the pose.
+const ROUGHLY_SETTLED_PX: f64 = 0.05;
+/// Bounds of the fitted blur, px.
+const BLUR_RANGE_PX: (f64, f64) = (0.4, 3.0);
+/// Width of the strip along the plate's border that the surroundings blur into, px.
+const EDGE_STRIP_PX: f64 = 1.2;
+/// Strip along the checker's border that is left out, in units of the blur.
+const CHECKER_RIM: f64 = 1.5;
+/// Least weight (px of window) for a fit.
+const MIN_WEIGHT_PX: f64 = 16.0;
+
+/// What is fitted around a point, apart from its position.
+pub(super) struct Mark<'a> {
+    layout: &'a PlateLayout,
+    index: usize,
+    kind: PointKind,
+    pub at_m: Vector2<f64>,
+    radius_m: f64,
+    /// Half the gap to the nearest other mark, m.
+    half_gap_m: f64,
+}
+
+impl<'a> Mark<'a> {
+    pub fn new(layout: &'a PlateLayout, index: usize) -> Option<Self> {
+        let at = layout.point(index)?;
+        let at_m = Vector2::new(at.x, at.y);
+        let (kind, radius_m) = match layout.discs.get(index) {
+            Some(d) => (PointKind::Disc, d.radius_m),
+            None => (PointKind::Saddle, layout.saddle.as_ref()?.half_size_m),
+        };
+        let mut gap = f64::INFINITY;
+        for (_, d) in layout.discs.iter().enumerate().filter(|(i, _)| *i != index) {
+            gap = gap.min((Vector2::new(d.x_m, d.y_m) - at_m).norm() - d.radius_m - radius_m);
+        }
+        if let (PointKind::Disc, Some(s)) = (kind, &layout.saddle) {
+            let dx = ((at_m.x - s.x_m).abs() - s.half_size_m).max(0.0);
+            let dy = ((at_m.y - s.y_m).abs() - s.half_size_m).max(0.0);
+            gap = gap.min(dx.hypot(dy) - radius_m);
+        }
+        Some(Self {
+            layout,
+            index,
+            kind,
+            at_m,
+            radius_m,
+            half_gap_m: 0.5 * gap,
+        })
+    }
+
+    fn model(&self, map: &LocalMap, blur_px: f64) -> Option<MarkModel> {
+        match self.kind {
+            PointKind::Disc => self
+                .layout
+                .discs
+                .get(self.index)
+                .map(|d| MarkModel::disc(map, d, blur_px)),
+            PointKind::Saddle => self
+                .layout
+                .saddle
+                .as_ref()
+                .map(|s| MarkModel::saddle(map, s, blur_px)),
+        }
+    }
+}
+
+/// Fits position, gain, offset and, if `free_blur`, the blur; `rough` stops early.
+pub(super) fn fit(
+    image: &Image8,
+    mark: &Mark,
+    start: &LocalMap,
+    blur_px: f64,
+    free_blur: bool,
+    rough: bool,
+    rules: &DetectionRules,
+) -> Result<MarkFit, PointFault> {
+    let (shortest, longest) = start.scales();
+    let radius_px = mark.radius_m * shortest;
+    if !(radius_px >= rules.min_mark_radius_px) {
+        return Err(PointFault::TooSmall {
+            found_px: radius_px,
+            needed_px: rules.min_mark_radius_px,
+        });
+    }
+    let margin = rules
+        .window_margin_px
+        .min((mark.half_gap_m * shortest).max(1.0));
+    let reach = match mark.kind {
+        PointKind::Disc => mark.radius_m * longest + margin + 1.0,
+        PointKind::Saddle => rules.saddle_window_px + 1.0,
+    };
+    let border = rules.image_border_px;
+    let settled_px = if rough {
+        ROUGHLY_SETTLED_PX
+    } else {
+        SETTLED_PX
+    };
+    let (mut centre, mut blur) = (start.pixel_px, blur_px);
+    let mut last = None;
+    for _ in 0..MAX_STEPS {
+        let inside =
+            |x: f64, size: u32| x - reach >= border && x + reach <= f64::from(size) - 1.0 - border;
+        if !(inside(centre.x, image.width_px) && inside(centre.y, image.height_px)) {
+            return Err(PointFault::OutsideImage {
+                u_px: centre.x,
+                v_px: centre.y,
+            });
+        }
+        let diverged = |moved_px: f64| PointFault::Diverged {
+            moved_px,
+            limit_px: rules.max_correction_px,
+        };
+        let step = gauss_newton_step(
+            image, mark, start, centre, blur, free_blur, margin, reach, rules,
+        )
+        .ok_or_else(|| diverged((centre - start.pixel_px).norm()))?;
+        if step.weight < MIN_WEIGHT_PX {
+            return Err(PointFault::TooSmall {
+                found_px: (step.weight / std::f64::consts::PI).sqrt(),
+                needed_px: (MIN_WEIGHT_PX / std::f64::consts::PI).sqrt(),
+            });
+        }
+        if step.contrast_dn < rules.min_contrast_dn {
+            return Err(PointFault::LowContrast {
+                found_dn: step.contrast_dn,
+                needed_dn: rules.min_contrast_dn,
+            });
+        }
+        let length = step.shift.norm();
+        centre += step.shift * (1.0f64).min(1.0 / length.max(1e-9));
+        blur = (blur + step.blur_shift.clamp(-0.3, 0.3)).clamp(BLUR_RANGE_PX.0, BLUR_RANGE_PX.1);
+        let moved = (centre - start.pixel_px).norm();
+        if !(moved <= rules.max_correction_px) {
+            return Err(diverged(moved));
+        }
+        let settled = length < settled_px;
+        last = Some((step, settled));
+        if settled {
+            break;
+        }
+    }
+    let Some((step, true)) = last else {
+        return Err(PointFault::Diverged {
+            moved_px: (centre - start.pixel_px).norm(),
+            limit_px: rules.max_correction_px,
+        });
+    };
+    if step.saturated > rules.max_saturated_fraction {
+        return Err(PointFault::Saturated {
+            fraction: step.saturated,
+            limit: rules.max_saturated_fraction,
+        });
+    }
+    let limit_dn = rules.max_residual_fraction * step.contrast_dn + rules.noise_dn;
+    if step.rms_dn > limit_dn {
+        return Err(PointFault::Misfit {
+            rms_dn: step.rms_dn,
+            limit_dn,
+        });
+    }
+    Ok(MarkFit {
+        pixel_px: centre,
+        sigma_px: step.sigma_px.hypot(rules.sigma_floor_px),
+        contrast_dn: step.contrast_dn,
+        blur_px: blur,
+    })
+}
+
+struct Step {
+    shift: Vector2<f64>,
+    blur_shift: f64,
+    contrast_dn: f64,
+    rms_dn: f64,
+    sigma_px: f64,
+    saturated: f64,
+    weight: f64,
+}
+
+/// One linearised solution around `centre`; `None` if it is singular.
+#[allow(clippy::too_many_arguments)] // one inner step, called from one place
+fn gauss_newton_step(
+    image: &Image8,
+    mark: &Mark,
+    map: &LocalMap,
+    centre: Vector2<f64>,
+    blur_px: f64,
+    free_blur: bool,
+    margin_px: f64,
+    reach_px: f64,
+    rules: &DetectionRules,
+) -> Option<Step> {
+    let model = mark.model(map, blur_px)?;
+    let edge = EdgeDistance::new(mark, map);
+    let width = image.width_px as usize;
+    let (u0, u1) = (
+        (centre.x - reach_px).ceil() as usize,
+        (centre.x + reach_px) as usize,
+    );
+    let (v0, v1) = (
+        (centre.y - reach_px).ceil() as usize,
+        (centre.y + reach_px) as usize,
+    );
+    let margin = margin_px as f32 + 0.5;
+    let rim = (CHECKER_RIM * blur_px) as f32;
+    let window = rules.saddle_window_px as f32 + 0.5;
+    let (mut saturated, mut counted) = (0u32, 0u32);
+    let mut sums = [0.0f64; 21];
+    for v in v0..=v1 {
+        let dv = (v as f64 - centre.y) as f32;
+        let mut row = [0.0f32; 21];
+        let line = &image.pixels[v * width + u0..=v * width + u1];
+        for (i, &pixel) in line.iter().enumerate() {
+            let du = ((u0 + i) as f64 - centre.x) as f32;
+            let d = model.at(du, dv);
+            let weight = match mark.kind {
+                PointKind::Disc => margin - d.edge_px,
+                PointKind::Saddle => (-d.edge_px - rim).min(window - (du * du + dv * dv).sqrt()),
+            };
+            let weight = weight.min(edge.at(du, dv)).clamp(0.0, 1.0);
+            if weight <= 0.0 {
+                continue;
+            }
+            counted += 1;
+            saturated += u32::from(pixel >= rules.saturation_dn);
+            let a = [-d.du, -d.dv, d.value, 1.0, d.dsigma, f32::from(pixel)];
+            let mut at = 0;
+            for p in 0..6 {
+                let wp = weight * a[p];
+                for aq in &a[p..] {
+                    row[at] += wp * aq;
+                    at += 1;
+                }
+            }
+        }
+        for (s, r) in sums.iter_mut().zip(row) {
+            *s += f64::from(r);
+        }
+    }
+    let mut normal = SMatrix::<f64, 5, 5>::zeros();
+    let mut right = SVector::<f64, 5>::zeros();
+    let mut square = 0.0;
+    let mut at = 0;
+    for p in 0..6 {
+        for q in p..6 {
+            match (p < 5, q < 5) {
+                (true, true) => {
+                    normal[(p, q)] = sums[at];
+                    normal[(q, p)] = sums[at];
+                }
+                (true, false) => right[p] = sums[at],
+                _ => square = sums[at],
+            }
+            at += 1;
+        }
+    }
+    let weight = normal[(3, 3)];
+    if weight < MIN_WEIGHT_PX {
+        return Some(Step {
+            shift: Vector2::zeros(),
+            blur_shift: 0.0,
+            contrast_dn: 0.0,
+            rms_dn: 0.0,
+            sigma_px: 0.0,
+            saturated: 0.0,
+            weight,
+        });
+    }
+    if !free_blur {
+        for p in 0..4 {
+            normal[(p, 4)] = 0.0;
+            normal[(4, p)] = 0.0;
+        }
+        normal[(4, 4)] = 1.0;
+        right[4] = 0.0;
+    }
+    let factor = normal.cholesky()?;
+    let x = factor.solve(&right);
+    let gain = x[2];
+    if gain == 0.0 || !x.iter().all(|x| x.is_finite()) {
+        return None;
+    }
+    let freedom = (weight - 5.0).max(1.0);
+    let rms_dn = ((square - x.dot(&right)).max(0.0) / freedom).sqrt();
+    let covariance = factor.inverse();
+    let mean_variance = 0.5 * (covariance[(0, 0)] + covariance[(1, 1)]);
+    // quantisation alone is 0.29 DN
+    let sigma_px = rms_dn.max(0.29) * mean_variance.sqrt() / gain.abs();
+    Some(Step {
+        shift: Vector2::new(x[0], x[1]) / gain,
+        blur_shift: if free_blur { x[4] / gain } else { 0.0 },
+        contrast_dn: -gain,
+        rms_dn,
+        sigma_px,
+        saturated: f64::from(saturated) / f64::from(counted.max(1)),
+        weight,
+    })
+}
+
+/// Distance (px, less the blurred strip) of a pixel from the plate's border, to first order.
+struct EdgeDistance {
+    along: [[f32; 2]; 2],
+    at: [f32; 2],
+    half: [f32; 2],
+}
+
+impl EdgeDistance {
+    fn new(mark: &Mark, map: &LocalMap) -> Self {
+        let row = |i: usize| {
+            let r = map.inverse.row(i);
+            (r[0] as f32, r[1] as f32, r.norm())
+        };
+        let ((xu, xv, xn), (yu, yv, yn)) = (row(0), row(1));
+        let scale = |value: f64, norm: f64| (value / norm) as f32;
+        Self {
+            along: [
+                [xu / xn as f32, xv / xn as f32],
+                [yu / yn as f32, yv / yn as f32],
+            ],
+            at: [scale(mark.at_m.x, xn), scale(mark.at_m.y, yn)],
+            half: [
+                scale(mark.layout.half_width_m, xn),
+                scale(mark.layout.half_height_m, yn),
+            ],
+        }
+    }
+
+    #[inline]
+    fn at(&self, du: f32, dv: f32) -> f32 {
+        let axis = |k: usize| {
+            let x = self.at[k] + self.along[k][0] * du + self.along[k][1] * dv;
+            self.half[k] - x.abs()
+        };
+        axis(0).min(axis(1)) - EDGE_STRIP_PX as f32
+    }
+}

@@ -1,0 +1,490 @@
+//! A disc standing alone: its ellipse, and with a camera and the disc's normal the image of its
+//! true centre.
+//!
+//! The middle of the ellipse is not the image of the disc's middle: at range d, radius r and tilt w
+//! they differ by about f (r/d)^2 sin w cos w px. With Q the ellipse's cone in the camera (rays x
+//! with x^T Q x = 0) and n the normal of the disc's plane, the ray to the centre is Q^-1 n, the pole
+//! of the plane's vanishing line.
+
+use nalgebra::{Matrix3, SMatrix, SVector, SymmetricEigen, Vector2, Vector3};
+use rover_cameras::Camera;
+use serde::{Deserialize, Serialize};
+
+use super::blobs::{Blob, BlobRules, blobs};
+use super::pixels::{PixelModel, fit_pixels};
+use super::{Finding, NoFinding, distinct, positive};
+use crate::fiducial::normal_at;
+use crate::image::Image8;
+use crate::ncc::Window;
+
+/// Which discs are looked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Polarity {
+    /// Dark discs on light ground.
+    Dark,
+    /// Light discs on dark ground.
+    Light,
+    /// Both.
+    Either,
+}
+
+/// Thresholds of the disc detector.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DiscRules {
+    /// Dark, light, or either.
+    pub polarity: Polarity,
+    /// Least semi-axis along the shortest direction, px.
+    pub min_radius_px: f64,
+    /// Largest semi-axis along the longest direction, px.
+    pub max_radius_px: f64,
+    /// Least ratio of the semi-axes.
+    pub min_axis_ratio: f64,
+    /// Largest difference of a region's area from that of an ellipse with the same moments, as a
+    /// fraction; pixels of the outline are granted on top.
+    pub max_fill_error: f64,
+    /// Least difference between disc and ground, DN.
+    pub min_contrast_dn: f64,
+    /// Least correlation of model and image.
+    pub min_score: f64,
+    /// Largest rms difference between model and image, as a fraction of the contrast; `noise_dn` is
+    /// granted on top.
+    pub max_residual_fraction: f64,
+    /// Largest grey noise that the residual check puts up with, DN.
+    pub noise_dn: f64,
+    /// Largest blur of the edge, px.
+    pub max_blur_px: f64,
+    /// Ground that the fit takes in beyond the edge, px.
+    pub margin_px: f64,
+    /// Largest standard deviation of the result, px.
+    pub max_sigma_px: f64,
+    /// Largest fraction of clipped pixels.
+    pub max_saturated_fraction: f64,
+    /// Smallest standard deviation that is ever claimed, px.
+    pub sigma_floor_px: f64,
+}
+
+impl Default for DiscRules {
+    fn default() -> Self {
+        Self {
+            polarity: Polarity::Dark,
+            min_radius_px: 2.5,
+            max_radius_px: 80.0,
+            min_axis_ratio: 0.3,
+            max_fill_error: 0.06,
+            min_contrast_dn: 30.0,
+            min_score: 0.965,
+            max_residual_fraction: 0.05,
+            noise_dn: 6.0,
+            max_blur_px: 1.6,
+            margin_px: 2.5,
+            max_sigma_px: 0.2,
+            max_saturated_fraction: 0.7,
+            sigma_floor_px: 0.004,
+        }
+    }
+}
+
+impl DiscRules {
+    fn validate(&self) -> Result<(), NoFinding> {
+        for (name, x) in [
+            ("min_radius_px", self.min_radius_px),
+            (
+                "max_radius_px less min_radius_px",
+                self.max_radius_px - self.min_radius_px,
+            ),
+            ("min_axis_ratio", self.min_axis_ratio),
+            ("max_fill_error", self.max_fill_error),
+            ("min_contrast_dn", self.min_contrast_dn),
+            ("min_score", self.min_score),
+            ("max_residual_fraction", self.max_residual_fraction),
+            ("noise_dn", self.noise_dn),
+            ("max_blur_px", self.max_blur_px),
+            ("margin_px", self.margin_px),
+            ("max_sigma_px", self.max_sigma_px),
+            ("max_saturated_fraction", self.max_saturated_fraction),
+            ("sigma_floor_px", self.sigma_floor_px),
+        ] {
+            positive("disc rules", name, x)?;
+        }
+        Ok(())
+    }
+}
+
+/// What it takes to tell the disc's centre from its ellipse's.
+#[derive(Clone, Copy, Debug)]
+pub struct DiscTruth<'a> {
+    /// The camera that took the image.
+    pub camera: &'a Camera,
+    /// Normal of the disc's plane in the frame of the camera model's vectors, any length and sign.
+    pub normal: Vector3<f64>,
+}
+
+/// Parameters: centre u, v; change of B (11, 12, 22) in units of `scale`; blur. The disc's radius
+/// coordinate of an offset d is r = |B d|, B symmetric.
+struct Ellipse {
+    b: [f64; 3],
+    scale: f64,
+    margin_px: f64,
+    max_blur_px: f64,
+}
+
+const MIN_BLUR_PX: f64 = 0.3;
+
+impl Ellipse {
+    /// The ellipse of a region: B is the inverse square root of its shape.
+    fn of(blob: &Blob, rules: &DiscRules) -> Option<Self> {
+        let [a, b, c] = blob.shape();
+        let det = a * c - b * b;
+        if !(det > 0.0 && a > 0.0) {
+            return None;
+        }
+        // square root of a symmetric 2 x 2, then its inverse
+        let s = det.sqrt();
+        let t = (a + c + 2.0 * s).sqrt();
+        let root = [(a + s) / t, b / t, (c + s) / t];
+        let root_det = root[0] * root[2] - root[1] * root[1];
+        let inverse = [root[2] / root_det, -root[1] / root_det, root[0] / root_det];
+        Some(Self {
+            b: inverse,
+            scale: 0.5 * (inverse[0] + inverse[2]),
+            margin_px: rules.margin_px,
+            max_blur_px: rules.max_blur_px + 0.5,
+        })
+    }
+
+    fn matrix(&self, p: &[f64; 6]) -> [f64; 3] {
+        [0, 1, 2].map(|i| self.b[i] + self.scale * p[2 + i])
+    }
+
+    /// Shortest and longest semi-axis, px.
+    fn semi_axes(&self, p: &[f64; 6]) -> (f64, f64) {
+        let [a, b, c] = self.matrix(p);
+        let (mean, half) = (0.5 * (a + c), 0.5 * (a - c));
+        let spread = (half * half + b * b).sqrt();
+        (1.0 / (mean + spread), 1.0 / (mean - spread).max(1e-6))
+    }
+}
+
+impl PixelModel<6> for Ellipse {
+    fn at(&self, p: &[f64; 6], u: f64, v: f64, slopes: &mut [f64; 6]) -> (f64, f64) {
+        let [a, b, c] = self.matrix(p);
+        let (du, dv) = (u - p[0], v - p[1]);
+        let (x, y) = (a * du + b * dv, b * du + c * dv);
+        let radius = (x * x + y * y).sqrt();
+        if radius < 1e-3 {
+            return (1.0, 1.0);
+        }
+        let (nx, ny) = (x / radius, y / radius);
+        let (gu, gv) = (a * nx + b * ny, b * nx + c * ny);
+        let slope = (gu * gu + gv * gv).sqrt();
+        let edge = (radius - 1.0) / slope;
+        let weight = (self.margin_px + 0.5 - edge).clamp(0.0, 1.0);
+        if weight <= 0.0 {
+            return (0.0, 0.0);
+        }
+        let z = edge / p[5];
+        let (inside, density) = normal_at(-z as f32);
+        let rate = f64::from(density) / p[5];
+        let by_b = -rate / slope * self.scale;
+        *slopes = [
+            rate * gu / slope,
+            rate * gv / slope,
+            by_b * nx * du,
+            by_b * (nx * dv + ny * du),
+            by_b * ny * dv,
+            rate * z,
+        ];
+        (f64::from(inside), weight)
+    }
+
+    fn reach(&self, p: &[f64; 6]) -> f64 {
+        self.semi_axes(p).1 + self.margin_px + 0.5
+    }
+
+    fn advance(&self, p: &mut [f64; 6], step: &[f64; 6]) {
+        for i in 0..2 {
+            p[i] += step[i].clamp(-1.0, 1.0);
+        }
+        for i in 2..5 {
+            // B stays within a third of its start
+            p[i] = (p[i] + step[i].clamp(-0.1, 0.1)).clamp(-0.3, 0.3);
+        }
+        p[5] = (p[5] + step[5].clamp(-0.3, 0.3)).clamp(MIN_BLUR_PX, self.max_blur_px);
+    }
+}
+
+/// Shape checks on a region, before it is fitted.
+fn plausible(blob: &Blob, rules: &DiscRules) -> Result<(), NoFinding> {
+    let shape = |what, found, expected: String| {
+        Err(NoFinding::Shape {
+            what,
+            found,
+            expected,
+        })
+    };
+    let Some((short, long)) = blob.semi_axes() else {
+        return shape(
+            "semi-axis in px",
+            0.0,
+            format!("at least {}", rules.min_radius_px),
+        );
+    };
+    if short < rules.min_radius_px * 0.85 {
+        return Err(NoFinding::TooSmall {
+            found_px: short,
+            needed_px: rules.min_radius_px,
+        });
+    }
+    if long > rules.max_radius_px * 1.1 {
+        return shape(
+            "semi-axis in px",
+            long,
+            format!("at most {}", rules.max_radius_px),
+        );
+    }
+    if short / long < rules.min_axis_ratio {
+        return shape(
+            "ratio of the semi-axes",
+            short / long,
+            format!("at least {}", rules.min_axis_ratio),
+        );
+    }
+    let error = (blob.fill() - 1.0).abs();
+    let limit = rules.max_fill_error + 0.35 / short;
+    if error > limit {
+        return shape(
+            "area beside an ellipse's, as a fraction,",
+            error,
+            format!("at most {limit:.3}"),
+        );
+    }
+    Ok(())
+}
+
+fn fit(
+    image: &Image8,
+    blob: &Blob,
+    dark: bool,
+    rules: &DiscRules,
+    truth: Option<&DiscTruth>,
+) -> Result<Finding, NoFinding> {
+    plausible(blob, rules)?;
+    let model = Ellipse::of(blob, rules).ok_or_else(|| {
+        NoFinding::NothingThere("a region without extent in two directions".into())
+    })?;
+    let start = [blob.centre[0], blob.centre[1], 0.0, 0.0, 0.0, 0.8];
+    let found = fit_pixels(image, &model, start, 2.0)?;
+    let p = &found.parameters;
+    let contrast_dn = if dark { -found.gain_dn } else { found.gain_dn };
+    if contrast_dn < rules.min_contrast_dn {
+        return Err(NoFinding::LowContrast {
+            found_dn: contrast_dn,
+            needed_dn: rules.min_contrast_dn,
+        });
+    }
+    let (short, long) = model.semi_axes(p);
+    if short < rules.min_radius_px {
+        return Err(NoFinding::TooSmall {
+            found_px: short,
+            needed_px: rules.min_radius_px,
+        });
+    }
+    if short / long < rules.min_axis_ratio {
+        return Err(NoFinding::Shape {
+            what: "ratio of the semi-axes",
+            found: short / long,
+            expected: format!("at least {}", rules.min_axis_ratio),
+        });
+    }
+    let blur_limit = rules.max_blur_px.min(0.5 * short);
+    if p[5] > blur_limit {
+        return Err(NoFinding::Shape {
+            what: "blur of the edge in px",
+            found: p[5],
+            expected: format!("at most {blur_limit:.2}"),
+        });
+    }
+    if found.score < rules.min_score {
+        return Err(NoFinding::LowScore {
+            score: found.score,
+            limit: rules.min_score,
+        });
+    }
+    let limit_dn = rules.max_residual_fraction * contrast_dn + rules.noise_dn;
+    if found.rms_dn > limit_dn {
+        return Err(NoFinding::Misfit {
+            rms_dn: found.rms_dn,
+            limit_dn,
+        });
+    }
+    if found.saturated > rules.max_saturated_fraction {
+        return Err(NoFinding::Saturated {
+            fraction: found.saturated,
+            limit: rules.max_saturated_fraction,
+        });
+    }
+    let floor = rules.sigma_floor_px;
+    let sigma_px = (found.sigma_px * found.sigma_px + floor * floor).sqrt();
+    if sigma_px > rules.max_sigma_px {
+        return Err(NoFinding::Uncertain {
+            sigma_px,
+            limit_px: rules.max_sigma_px,
+        });
+    }
+    let mut centre = [p[0], p[1]];
+    if let Some(truth) = truth {
+        let at = true_centre(centre, model.matrix(p), truth)?;
+        centre = [at.x, at.y];
+    }
+    Ok(Finding::at(centre[0], centre[1], found.score, sigma_px))
+}
+
+/// Parameters t of the points ((1 - t^2), 2 t) / (1 + t^2) of a quarter of the unit circle.
+const QUARTER: [f64; 6] = [0.0, 0.13, 0.27, 0.42, 0.58, 0.77];
+
+/// The image of the disc's centre, from its ellipse (centre, B) and its plane's normal.
+fn true_centre(
+    centre: [f64; 2],
+    [a, b, c]: [f64; 3],
+    truth: &DiscTruth,
+) -> Result<Vector2<f64>, NoFinding> {
+    let bad = |e: &dyn std::fmt::Display| NoFinding::BadInput(format!("disc centre: {e}"));
+    let det = a * c - b * b;
+    let middle = Vector2::new(centre[0], centre[1]);
+    let axis = truth.camera.ray(&middle).map_err(|e| bad(&e))?;
+    let z = axis.direction.into_inner();
+    // any frame about the ellipse's ray
+    let other = if z.x.abs() < 0.6 {
+        Vector3::x()
+    } else {
+        Vector3::y()
+    };
+    let x = z.cross(&other).normalize();
+    let basis = Matrix3::from_columns(&[x, z.cross(&x), z]);
+    let mut normal = SMatrix::<f64, 6, 6>::zeros();
+    let mut rows = Vec::with_capacity(4 * QUARTER.len());
+    let mut reach = 0.0f64;
+    for t in QUARTER {
+        let (s, k) = (2.0 * t / (1.0 + t * t), (1.0 - t * t) / (1.0 + t * t));
+        for (e0, e1) in [(k, s), (-s, k), (-k, -s), (s, -k)] {
+            // B^-1 e
+            let d = Vector2::new(c * e0 - b * e1, a * e1 - b * e0) / det;
+            let ray = truth.camera.ray(&(middle + d)).map_err(|e| bad(&e))?;
+            let q = basis.transpose() * ray.direction.into_inner();
+            let q = Vector2::new(q.x / q.z, q.y / q.z);
+            reach = reach.max(q.norm());
+            rows.push(q);
+        }
+    }
+    for q in rows {
+        let (x, y) = (q.x / reach, q.y / reach);
+        let row = SVector::<f64, 6>::from([x * x, x * y, y * y, x, y, 1.0]);
+        normal += row * row.transpose();
+    }
+    let eigen = SymmetricEigen::new(normal);
+    let least = (0..6)
+        .min_by(|&i, &j| eigen.eigenvalues[i].total_cmp(&eigen.eigenvalues[j]))
+        .unwrap_or(0);
+    let k = eigen.eigenvectors.column(least);
+    let conic = Matrix3::new(
+        k[0],
+        0.5 * k[1],
+        0.5 * k[3],
+        0.5 * k[1],
+        k[2],
+        0.5 * k[4],
+        0.5 * k[3],
+        0.5 * k[4],
+        k[5],
+    );
+    let scale = Matrix3::from_diagonal(&Vector3::new(1.0 / reach, 1.0 / reach, 1.0));
+    let cone = basis * (scale * conic * scale) * basis.transpose();
+    let length = truth.normal.norm();
+    if !(length.is_finite() && length > 0.0) {
+        return Err(bad(&format!(
+            "the normal has length {length}, expected above 0"
+        )));
+    }
+    let towards = cone
+        .try_inverse()
+        .map(|inverse| inverse * (truth.normal / length))
+        .ok_or_else(|| bad(&"the ellipse is degenerate"))?;
+    let towards = if towards.dot(&z) < 0.0 {
+        -towards
+    } else {
+        towards
+    };
+    let at = truth
+        .camera
+        .project(&(axis.origin + towards.normalize()))
+        .map_err(|e| bad(&e))?;
+    let reach_px = (at - middle).norm();
+    // the centre lies inside its ellipse; a normal across the line of sight says otherwise
+    let d = at - middle;
+    let (bx, by) = (a * d.x + b * d.y, b * d.x + c * d.y);
+    if !((bx * bx + by * by).sqrt() < 0.7) {
+        return Err(bad(&format!(
+            "with this normal it would lie {reach_px:.2} px from its ellipse's middle; the disc \
+             would be seen edge on"
+        )));
+    }
+    Ok(at)
+}
+
+/// Discs closer than this are one, px.
+const SAME_PLACE_PX: f64 = 2.0;
+
+/// All discs in a window, the best first (by score). With `truth` the positions are the images of
+/// the discs' true centres, otherwise the middles of their ellipses.
+///
+/// # Errors
+/// [`NoFinding`]: what refused the largest region, or `NothingThere` without one.
+pub fn disc(
+    image: &Image8,
+    window: Window,
+    rules: &DiscRules,
+    truth: Option<&DiscTruth>,
+) -> Result<Vec<Finding>, NoFinding> {
+    image.validate()?;
+    rules.validate()?;
+    let area = std::f64::consts::PI * rules.min_radius_px * rules.min_radius_px;
+    let largest = std::f64::consts::PI * rules.max_radius_px * rules.max_radius_px;
+    let kinds: &[bool] = match rules.polarity {
+        Polarity::Dark => &[true],
+        Polarity::Light => &[false],
+        Polarity::Either => &[true, false],
+    };
+    let mut found: Vec<Finding> = Vec::new();
+    let mut refusal: Option<(f64, NoFinding)> = None;
+    for &dark in kinds {
+        let regions = BlobRules {
+            dark,
+            min_contrast_dn: rules.min_contrast_dn.min(255.0) as u8,
+            area: (0.6 * area, 1.3 * largest),
+        };
+        for blob in blobs(image, window, &regions) {
+            if blob.at_border {
+                continue;
+            }
+            match fit(image, &blob, dark, rules, truth) {
+                Ok(one) => found.push(one),
+                Err(e) => {
+                    if refusal.as_ref().is_none_or(|(area, _)| blob.area > *area) {
+                        refusal = Some((blob.area, e));
+                    }
+                }
+            }
+        }
+    }
+    found.sort_by(|a, b| b.score.total_cmp(&a.score));
+    let found = distinct(found, SAME_PLACE_PX);
+    if found.is_empty() {
+        return Err(refusal.map_or_else(
+            || NoFinding::NothingThere("no region of the size and contrast".into()),
+            |(_, e)| e,
+        ));
+    }
+    Ok(found)
+}

@@ -1,0 +1,359 @@
+//! The crossing of two edges: a checker's corner, standing alone.
+//!
+//! Candidates are the maxima of -det(Hessian) of the smoothed image, where the image is a saddle
+//! surface; each is then fitted by the product of two blurred edges,
+//! value = E(n1.d / s) E(n2.d / s), E(x) = 2 Phi(x) - 1, with both edge directions, the blur s and
+//! the centre free. The model is even under d -> -d, so that unequal light over the window and the
+//! approximation of a skew crossing's blur move the centre only in second order.
+
+use serde::{Deserialize, Serialize};
+
+use super::pixels::{PixelModel, fit_pixels};
+use super::{Finding, NoFinding, cut, positive};
+use crate::fiducial::normal_at;
+use crate::image::{Image8, ImageF};
+use crate::ncc::Window;
+
+/// Thresholds of the saddle detector.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SaddleRules {
+    /// Radius of the fitted window, px.
+    pub window_px: f64,
+    /// Smoothing of the candidate search, px.
+    pub smoothing_px: f64,
+    /// Least difference between light and dark quadrants, DN.
+    pub min_contrast_dn: f64,
+    /// Least correlation of model and image.
+    pub min_score: f64,
+    /// Largest rms difference between model and image, as a fraction of the contrast; `noise_dn` is
+    /// granted on top.
+    pub max_residual_fraction: f64,
+    /// Largest grey noise that the residual check puts up with, DN.
+    pub noise_dn: f64,
+    /// Least sine of the angle between the edges.
+    pub min_sine: f64,
+    /// Largest blur, px.
+    pub max_blur_px: f64,
+    /// Largest standard deviation of the result, px.
+    pub max_sigma_px: f64,
+    /// Largest fraction of clipped pixels.
+    pub max_saturated_fraction: f64,
+    /// Candidates that are fitted, the strongest first.
+    pub max_candidates: usize,
+    /// Smallest standard deviation that is ever claimed, px.
+    pub sigma_floor_px: f64,
+}
+
+impl Default for SaddleRules {
+    fn default() -> Self {
+        Self {
+            window_px: 8.0,
+            smoothing_px: 1.5,
+            min_contrast_dn: 20.0,
+            min_score: 0.93,
+            max_residual_fraction: 0.06,
+            noise_dn: 6.0,
+            min_sine: 0.35,
+            max_blur_px: 2.5,
+            max_sigma_px: 0.2,
+            max_saturated_fraction: 0.6,
+            max_candidates: 64,
+            sigma_floor_px: 0.004,
+        }
+    }
+}
+
+impl SaddleRules {
+    fn validate(&self) -> Result<(), NoFinding> {
+        for (name, x) in [
+            ("window_px", self.window_px - 3.0),
+            ("smoothing_px", self.smoothing_px),
+            ("min_contrast_dn", self.min_contrast_dn),
+            ("min_score", self.min_score),
+            ("max_residual_fraction", self.max_residual_fraction),
+            ("noise_dn", self.noise_dn),
+            ("min_sine", self.min_sine),
+            ("max_blur_px", self.max_blur_px),
+            ("max_sigma_px", self.max_sigma_px),
+            ("max_saturated_fraction", self.max_saturated_fraction),
+            ("max_candidates", self.max_candidates as f64),
+            ("sigma_floor_px", self.sigma_floor_px),
+        ] {
+            positive("saddle rules (window_px less 3)", name, x)?;
+        }
+        Ok(())
+    }
+}
+
+/// Parameters: centre u, v; turn of the first and of the second edge normal; blur.
+struct Crossing {
+    normals: [[f64; 2]; 2],
+    window_px: f64,
+    max_blur_px: f64,
+}
+
+const MIN_BLUR_PX: f64 = 0.3;
+
+impl Crossing {
+    /// The normal turned by a tangent t: (n + t n') / |...|.
+    fn turned(&self, which: usize, t: f64) -> [f64; 2] {
+        let [x, y] = self.normals[which];
+        let (a, b) = (x - t * y, y + t * x);
+        let length = (a * a + b * b).sqrt();
+        [a / length, b / length]
+    }
+}
+
+impl PixelModel<5> for Crossing {
+    fn at(&self, p: &[f64; 5], u: f64, v: f64, slopes: &mut [f64; 5]) -> (f64, f64) {
+        let (du, dv) = (u - p[0], v - p[1]);
+        let weight = (self.window_px + 0.5 - (du * du + dv * dv).sqrt()).clamp(0.0, 1.0);
+        if weight <= 0.0 {
+            return (0.0, 0.0);
+        }
+        let edge = |which: usize, t: f64| {
+            let n = self.turned(which, t);
+            let distance = n[0] * du + n[1] * dv;
+            let z = distance / p[4];
+            let (below, density) = normal_at(z as f32);
+            let value = 2.0 * f64::from(below) - 1.0;
+            let rate = 2.0 * f64::from(density) / p[4];
+            let turn = (-n[1] * du + n[0] * dv) / (1.0 + t * t);
+            (value, [-rate * n[0], -rate * n[1], rate * turn, -rate * z])
+        };
+        let (a, da) = edge(0, p[2]);
+        let (b, db) = edge(1, p[3]);
+        *slopes = [
+            da[0] * b + a * db[0],
+            da[1] * b + a * db[1],
+            da[2] * b,
+            a * db[2],
+            da[3] * b + a * db[3],
+        ];
+        (a * b, weight)
+    }
+
+    fn reach(&self, _: &[f64; 5]) -> f64 {
+        self.window_px + 0.5
+    }
+
+    fn advance(&self, p: &mut [f64; 5], step: &[f64; 5]) {
+        for i in 0..2 {
+            p[i] += step[i].clamp(-1.0, 1.0);
+        }
+        for i in 2..4 {
+            p[i] = (p[i] + step[i].clamp(-0.2, 0.2)).clamp(-1.0, 1.0);
+        }
+        p[4] = (p[4] + step[4].clamp(-0.3, 0.3)).clamp(MIN_BLUR_PX, self.max_blur_px);
+    }
+}
+
+/// A place where the smoothed image is a saddle, with its second derivatives.
+struct Candidate {
+    u: f64,
+    v: f64,
+    strength: f32,
+    hessian: [f64; 3],
+}
+
+fn candidates(
+    image: &Image8,
+    window: Window,
+    rules: &SaddleRules,
+) -> Result<Vec<Candidate>, NoFinding> {
+    let margin = (4.0 * rules.smoothing_px).ceil() as u32 + 2;
+    let wide = Window {
+        left: window.left.saturating_sub(margin),
+        top: window.top.saturating_sub(margin),
+        width: window.width.saturating_add(2 * margin),
+        height: window.height.saturating_add(2 * margin),
+    }
+    .clipped(image);
+    let smooth = ImageF::from_image8(&cut(image, wide)?)?.blurred(rules.smoothing_px);
+    let (w, h) = (smooth.width(), smooth.height());
+    if w < 5 || h < 5 {
+        return Ok(Vec::new());
+    }
+    let mut response = vec![0.0f32; w * h];
+    for v in 1..h - 1 {
+        let (a, b, c) = (smooth.row(v - 1), smooth.row(v), smooth.row(v + 1));
+        let out = &mut response[v * w..(v + 1) * w];
+        for u in 1..w - 1 {
+            let uu = b[u - 1] - 2.0 * b[u] + b[u + 1];
+            let vv = a[u] - 2.0 * b[u] + c[u];
+            let uv = 0.25 * (a[u - 1] - a[u + 1] - c[u - 1] + c[u + 1]);
+            out[u] = uv * uv - uu * vv;
+        }
+    }
+    // twist of a crossing of this contrast under smoothing and a blur of 1.5 px, halved twice
+    let blur = rules.smoothing_px * rules.smoothing_px + 1.5 * 1.5;
+    let twist = 0.5 * rules.min_contrast_dn * 0.6366 / blur;
+    let limit = (0.25 * twist * twist * rules.min_sine * rules.min_sine) as f32;
+    let mut found = Vec::new();
+    for v in 2..h - 2 {
+        for u in 2..w - 2 {
+            let r = response[v * w + u];
+            if r < limit {
+                continue;
+            }
+            let inside = |x: usize, offset: u32, first: u32, length: u32| {
+                let x = x as u32 + offset;
+                x >= first && x < first.saturating_add(length)
+            };
+            if !(inside(u, wide.left, window.left, window.width)
+                && inside(v, wide.top, window.top, window.height))
+            {
+                continue;
+            }
+            let beaten = (0..25).filter(|k| *k != 12).any(|k| {
+                let at = (v + k / 5 - 2) * w + u + k % 5 - 2;
+                response[at] > r || (response[at] == r && k < 12)
+            });
+            if beaten {
+                continue;
+            }
+            let (a, b, c) = (smooth.row(v - 1), smooth.row(v), smooth.row(v + 1));
+            let uu = f64::from(b[u - 1] - 2.0 * b[u] + b[u + 1]);
+            let vv = f64::from(a[u] - 2.0 * b[u] + c[u]);
+            let uv = f64::from(0.25 * (a[u - 1] - a[u + 1] - c[u - 1] + c[u + 1]));
+            found.push(Candidate {
+                u: u as f64 + f64::from(wide.left),
+                v: v as f64 + f64::from(wide.top),
+                strength: r,
+                hessian: [uu, uv, vv],
+            });
+        }
+    }
+    found.sort_by(|a, b| {
+        b.strength
+            .total_cmp(&a.strength)
+            .then(a.v.total_cmp(&b.v))
+            .then(a.u.total_cmp(&b.u))
+    });
+    found.truncate(rules.max_candidates);
+    Ok(found)
+}
+
+/// Unit normals of the two edges: perpendicular to the directions in which the second derivative
+/// vanishes.
+fn edge_normals([uu, uv, vv]: [f64; 3]) -> Option<[[f64; 2]; 2]> {
+    let (mean, half) = (0.5 * (uu + vv), 0.5 * (uu - vv));
+    let spread = (half * half + uv * uv).sqrt();
+    let (high, low) = (mean + spread, mean - spread);
+    if !(high > 0.0 && low < 0.0) {
+        return None;
+    }
+    // eigenvector of the larger eigenvalue, by the better conditioned of two formulas
+    let (x, y) = if half >= 0.0 {
+        (half + spread, uv)
+    } else {
+        (uv, spread - half)
+    };
+    let length = (x * x + y * y).sqrt();
+    let (x, y) = (x / length, y / length);
+    let (a, b) = ((-low).sqrt(), high.sqrt());
+    let normal = |sign: f64| {
+        // direction a e1 + sign b e2 with e2 = (-y, x), turned by 90 degrees
+        let (dx, dy) = (a * x - sign * b * y, a * y + sign * b * x);
+        let length = (dx * dx + dy * dy).sqrt();
+        [-dy / length, dx / length]
+    };
+    Some([normal(1.0), normal(-1.0)])
+}
+
+fn fit(image: &Image8, candidate: &Candidate, rules: &SaddleRules) -> Result<Finding, NoFinding> {
+    let skew = |found| NoFinding::Shape {
+        what: "sine of the angle between the edges",
+        found,
+        expected: format!("at least {}", rules.min_sine),
+    };
+    let normals = edge_normals(candidate.hessian).ok_or_else(|| skew(0.0))?;
+    let model = Crossing {
+        normals,
+        window_px: rules.window_px,
+        max_blur_px: rules.max_blur_px + 0.5,
+    };
+    let start = [candidate.u, candidate.v, 0.0, 0.0, 0.8];
+    let found = fit_pixels(image, &model, start, 0.5 * rules.window_px)?;
+    let p = &found.parameters;
+    let (a, b) = (model.turned(0, p[2]), model.turned(1, p[3]));
+    let sine = (a[0] * b[1] - a[1] * b[0]).abs();
+    let contrast_dn = 2.0 * found.gain_dn.abs();
+    if contrast_dn < rules.min_contrast_dn {
+        return Err(NoFinding::LowContrast {
+            found_dn: contrast_dn,
+            needed_dn: rules.min_contrast_dn,
+        });
+    }
+    if sine < rules.min_sine {
+        return Err(skew(sine));
+    }
+    if p[4] > rules.max_blur_px {
+        return Err(NoFinding::Shape {
+            what: "blur in px",
+            found: p[4],
+            expected: format!("at most {}", rules.max_blur_px),
+        });
+    }
+    if found.score < rules.min_score {
+        return Err(NoFinding::LowScore {
+            score: found.score,
+            limit: rules.min_score,
+        });
+    }
+    let limit_dn = rules.max_residual_fraction * contrast_dn + rules.noise_dn;
+    if found.rms_dn > limit_dn {
+        return Err(NoFinding::Misfit {
+            rms_dn: found.rms_dn,
+            limit_dn,
+        });
+    }
+    if found.saturated > rules.max_saturated_fraction {
+        return Err(NoFinding::Saturated {
+            fraction: found.saturated,
+            limit: rules.max_saturated_fraction,
+        });
+    }
+    let sigma_px =
+        (found.sigma_px * found.sigma_px + rules.sigma_floor_px * rules.sigma_floor_px).sqrt();
+    if sigma_px > rules.max_sigma_px {
+        return Err(NoFinding::Uncertain {
+            sigma_px,
+            limit_px: rules.max_sigma_px,
+        });
+    }
+    Ok(Finding::at(p[0], p[1], found.score, sigma_px))
+}
+
+/// Places closer than this are one crossing, px.
+const SAME_PLACE_PX: f64 = 2.0;
+
+/// All crossings in a window, the best first (by score).
+///
+/// # Errors
+/// [`NoFinding`]: what refused the strongest candidate, or `NothingThere` without a candidate.
+pub fn saddle(
+    image: &Image8,
+    window: Window,
+    rules: &SaddleRules,
+) -> Result<Vec<Finding>, NoFinding> {
+    image.validate()?;
+    rules.validate()?;
+    let mut found: Vec<Finding> = Vec::new();
+    let mut refusal = None;
+    for candidate in candidates(image, window, rules)? {
+        match fit(image, &candidate, rules) {
+            Ok(one) => found.push(one),
+            Err(e) => {
+                refusal.get_or_insert(e);
+            }
+        }
+    }
+    found.sort_by(|a, b| b.score.total_cmp(&a.score));
+    let distinct = super::distinct(found, SAME_PLACE_PX);
+    if distinct.is_empty() {
+        return Err(refusal.unwrap_or_else(|| NoFinding::NothingThere("no saddle surface".into())));
+    }
+    Ok(distinct)
+}

@@ -1,0 +1,517 @@
+//! A picture found in an image by normalised cross-correlation, plain or as a predicted pose would
+//! show it, and refined by affine least-squares matching.
+
+use nalgebra::{Isometry3, Matrix2, Point3, SMatrix, SVector, Vector2};
+use rover_cameras::Camera;
+use serde::{Deserialize, Serialize};
+
+use super::{Finding, NoFinding, cut, near, positive};
+use crate::image::{Image8, ImageF};
+use crate::ncc::{Peak, TemplatePyramid, Window, search_peaks};
+use crate::sample::SplineImage;
+
+/// Thresholds of the template search.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TemplateRules {
+    /// Least NCC, in the search and after refinement.
+    pub min_score: f64,
+    /// Largest NCC of any other place, as a fraction of the best one's.
+    pub uniqueness_ratio: f64,
+    /// Resolutions of the search; 1 correlates at full resolution only.
+    pub levels: usize,
+    /// Whether rotation, scale and shear are fitted besides the position.
+    pub affine: bool,
+    /// Largest correction of the search's result by the fit, px.
+    pub max_correction_px: f64,
+    /// Largest change of any element of the affine matrix.
+    pub max_affine_change: f64,
+    /// Largest standard deviation of the result, px.
+    pub max_sigma_px: f64,
+    /// Smallest standard deviation that is ever claimed, px.
+    pub sigma_floor_px: f64,
+}
+
+impl Default for TemplateRules {
+    fn default() -> Self {
+        Self {
+            min_score: 0.7,
+            uniqueness_ratio: 0.9,
+            levels: 3,
+            affine: true,
+            max_correction_px: 2.0,
+            max_affine_change: 0.3,
+            max_sigma_px: 0.2,
+            sigma_floor_px: 0.005,
+        }
+    }
+}
+
+impl TemplateRules {
+    fn validate(&self) -> Result<(), NoFinding> {
+        for (name, x) in [
+            ("min_score", self.min_score),
+            ("uniqueness_ratio", self.uniqueness_ratio),
+            ("levels", self.levels as f64),
+            ("max_correction_px", self.max_correction_px),
+            ("max_affine_change", self.max_affine_change),
+            ("max_sigma_px", self.max_sigma_px),
+            ("sigma_floor_px", self.sigma_floor_px),
+        ] {
+            positive("template rules", name, x)?;
+        }
+        Ok(())
+    }
+}
+
+/// How the searched picture appears in the image.
+#[derive(Clone, Copy, Debug)]
+pub enum Appearance<'a> {
+    /// The picture's middle is expected at `place_px`, and an offset d of the picture at
+    /// `image_from_picture` d.
+    Affine {
+        /// Expected pixel of the picture's middle.
+        place_px: Vector2<f64>,
+        /// Takes picture offsets (px) to image offsets (px).
+        image_from_picture: Matrix2<f64>,
+    },
+    /// The picture is flat, `width_m` wide, and at a predicted pose: origin in its middle, x to its
+    /// right, y up, z out of it.
+    Pose {
+        /// The camera that took the image.
+        camera: &'a Camera,
+        /// Takes picture coordinates (m) to the frame of the camera model's vectors.
+        camera_frame_from_picture: Isometry3<f64>,
+        /// Width of the picture, from its first pixel's left edge to its last one's right, m.
+        width_m: f64,
+    },
+}
+
+/// A rectangle of values to be found.
+struct Patch {
+    width: usize,
+    height: usize,
+    values: Vec<f32>,
+    mask: Option<Vec<bool>>,
+    /// The reported point, from the rectangle's middle, px.
+    offset: Vector2<f64>,
+}
+
+/// Finds a picture in a window of the image.
+///
+/// # Errors
+/// [`NoFinding`] with the rule that refused.
+pub fn template(
+    image: &Image8,
+    picture: &Image8,
+    window: Window,
+    rules: &TemplateRules,
+) -> Result<Finding, NoFinding> {
+    picture.validate()?;
+    let patch = Patch {
+        width: picture.width_px as usize,
+        height: picture.height_px as usize,
+        values: picture.pixels.iter().map(|&p| f32::from(p)).collect(),
+        mask: None,
+        offset: Vector2::zeros(),
+    };
+    find(image, &patch, window, rules)
+}
+
+/// Finds a flat picture within `radius_px` of where its predicted appearance puts it, comparing the
+/// image with the picture warped accordingly.
+///
+/// # Errors
+/// [`NoFinding`] with the rule that refused.
+pub fn warped_template(
+    image: &Image8,
+    picture: &Image8,
+    appearance: &Appearance,
+    radius_px: f64,
+    rules: &TemplateRules,
+) -> Result<Finding, NoFinding> {
+    image.validate()?;
+    picture.validate()?;
+    let (patch, place) = warp(picture, appearance)?;
+    let (half_u, half_v) = (patch.width as f64 / 2.0, patch.height as f64 / 2.0);
+    let middle = place - patch.offset;
+    let high = near(image, [middle.x, middle.y], radius_px + half_v + 1.0)?;
+    let across = near(image, [middle.x, middle.y], radius_px + half_u + 1.0)?;
+    let window = Window {
+        left: across.left,
+        width: across.width,
+        top: high.top,
+        height: high.height,
+    };
+    find(image, &patch, window, rules)
+}
+
+/// Peaks closer than this are one place, px.
+const SAME_PLACE_PX: f64 = 3.0;
+
+fn find(
+    image: &Image8,
+    patch: &Patch,
+    window: Window,
+    rules: &TemplateRules,
+) -> Result<Finding, NoFinding> {
+    image.validate()?;
+    rules.validate()?;
+    let pyramid = TemplatePyramid::new(
+        patch.width,
+        patch.height,
+        &patch.values,
+        patch.mask.as_deref(),
+        rules.levels,
+    )
+    .map_err(|e| NoFinding::BadInput(e.to_string()))?;
+    let peaks = search_peaks(image, &pyramid, window);
+    let best = peaks.first().ok_or(NoFinding::BadInput(format!(
+        "the template has {} x {} px, the searched window {} x {} px",
+        patch.width, patch.height, window.width, window.height
+    )))?;
+    let low = |score: f64| NoFinding::LowScore {
+        score,
+        limit: rules.min_score,
+    };
+    if best.score < rules.min_score {
+        return Err(low(best.score));
+    }
+    let elsewhere = peaks[1..].iter().find(|p| {
+        let (du, dv) = (p.u_px - best.u_px, p.v_px - best.v_px);
+        du * du + dv * dv > SAME_PLACE_PX * SAME_PLACE_PX
+    });
+    if let Some(second) = elsewhere
+        && second.score > rules.uniqueness_ratio * best.score
+    {
+        return Err(NoFinding::NotUnique {
+            best: best.score,
+            second: second.score,
+            limit: rules.uniqueness_ratio,
+        });
+    }
+    let found = refine(image, patch, best, rules)?;
+    if found.score < rules.min_score {
+        return Err(low(found.score));
+    }
+    if found.sigma_px > rules.max_sigma_px {
+        return Err(NoFinding::Uncertain {
+            sigma_px: found.sigma_px,
+            limit_px: rules.max_sigma_px,
+        });
+    }
+    Ok(found)
+}
+
+const MAX_STEPS: usize = 20;
+/// A fit has settled when a step moves the middle by less, px.
+const SETTLED_PX: f64 = 0.002;
+/// Room around the patch that the fit may use, px.
+const ROOM_PX: u32 = 12;
+
+/// Affine least-squares matching from a peak. Derivatives are the template's, so that their noise
+/// is independent of the image's.
+fn refine(
+    image: &Image8,
+    patch: &Patch,
+    peak: &Peak,
+    rules: &TemplateRules,
+) -> Result<Finding, NoFinding> {
+    let (w, h) = (patch.width, patch.height);
+    let (half_u, half_v) = ((w as f64 - 1.0) / 2.0, (h as f64 - 1.0) / 2.0);
+    let outside = || NoFinding::OutsideImage {
+        u_px: peak.u_px,
+        v_px: peak.v_px,
+    };
+    let room = f64::from(ROOM_PX);
+    let clamp = |x: f64, size: u32| x.clamp(0.0, f64::from(size)) as u32;
+    let left = clamp((peak.u_px - half_u - room).floor(), image.width_px);
+    let top = clamp((peak.v_px - half_v - room).floor(), image.height_px);
+    let right = clamp((peak.u_px + half_u + room).ceil() + 1.0, image.width_px);
+    let bottom = clamp((peak.v_px + half_v + room).ceil() + 1.0, image.height_px);
+    let part = cut(
+        image,
+        Window {
+            left,
+            top,
+            width: right - left,
+            height: bottom - top,
+        },
+    )?;
+    let spline = SplineImage::new(&ImageF::from_image8(&part)?);
+    let corner = Vector2::new(f64::from(left), f64::from(top));
+    let scale = 1.0 / half_u.max(half_v).max(1.0);
+
+    // slopes by u, v and the four affine elements, then value and one, where the patch has them
+    let on = |i: usize, j: usize| patch.mask.as_ref().is_none_or(|m| m[j * w + i]);
+    let mut rows: Vec<(usize, SVector<f64, 8>)> = Vec::with_capacity(w * h);
+    for j in 1..h.saturating_sub(1) {
+        for i in 1..w.saturating_sub(1) {
+            if !(on(i, j) && on(i - 1, j) && on(i + 1, j) && on(i, j - 1) && on(i, j + 1)) {
+                continue;
+            }
+            let at = |i: usize, j: usize| f64::from(patch.values[j * w + i]);
+            let gu = 0.5 * (at(i + 1, j) - at(i - 1, j));
+            let gv = 0.5 * (at(i, j + 1) - at(i, j - 1));
+            let (x, y) = ((i as f64 - half_u) * scale, (j as f64 - half_v) * scale);
+            let row = [gu, gv, gu * x, gu * y, gv * x, gv * y, at(i, j), 1.0];
+            rows.push((j * w + i, SVector::from(row)));
+        }
+    }
+    let mut normal = SMatrix::<f64, 8, 8>::zeros();
+    for (_, row) in &rows {
+        normal.ger(1.0, row, row, 1.0);
+    }
+    let n = normal[(7, 7)];
+    if n < 24.0 {
+        return Err(NoFinding::TooSmall {
+            found_px: n.sqrt(),
+            needed_px: 24f64.sqrt(),
+        });
+    }
+    let (mean, square) = (normal[(6, 7)] / n, normal[(6, 6)]);
+    let patch_variance = square - n * mean * mean;
+    if !rules.affine {
+        for i in 2..6 {
+            normal.fill_row(i, 0.0);
+            normal.fill_column(i, 0.0);
+            normal[(i, i)] = 1.0;
+        }
+    }
+    for i in 0..6 {
+        normal[(i, i)] += 1e-6 * patch_variance / n + 1e-9;
+    }
+    let factor = normal.cholesky().ok_or(NoFinding::LowContrast {
+        found_dn: (patch_variance / n).max(0.0).sqrt(),
+        needed_dn: 1.0,
+    })?;
+
+    let start = Vector2::new(peak.u_px, peak.v_px);
+    let (mut centre, mut matrix) = (start, Matrix2::<f64>::identity());
+    let mut samples = vec![0.0f32; w * h];
+    for _ in 0..MAX_STEPS {
+        let first = centre - corner - matrix * Vector2::new(half_u, half_v);
+        let inside = spline.sample_grid(
+            [first.x, first.y],
+            [matrix.m11, matrix.m21],
+            [matrix.m12, matrix.m22],
+            w,
+            h,
+            &mut samples,
+        );
+        if !inside {
+            return border_peak(patch, peak, patch_variance, &rows, rules).ok_or_else(outside);
+        }
+        let mut right_side = SVector::<f64, 8>::zeros();
+        let (mut sum, mut squares) = (0.0, 0.0);
+        for (k, row) in &rows {
+            let y = f64::from(samples[*k]);
+            right_side.axpy(y, row, 1.0);
+            sum += y;
+            squares += y * y;
+        }
+        if !rules.affine {
+            for i in 2..6 {
+                right_side[i] = 0.0;
+            }
+        }
+        let x = factor.solve(&right_side);
+        let gain = x[6];
+        if !(gain > 0.05 && x.iter().all(|x| x.is_finite())) {
+            return Err(NoFinding::LowScore {
+                score: 0.0,
+                limit: rules.min_score,
+            });
+        }
+        // image(W(d)) = gain T(d + step): the warp goes against the step
+        let shift = -Vector2::new(x[0], x[1]) / gain;
+        let change = -Matrix2::new(x[2], x[3], x[4], x[5]) * (scale / gain);
+        let limit = |s: f64| s.clamp(-1.0, 1.0);
+        centre += matrix * shift.map(limit);
+        matrix *= Matrix2::identity() + change.map(|c| c.clamp(-0.1, 0.1));
+        let moved = (centre - start).norm();
+        if !(moved <= rules.max_correction_px) {
+            return Err(NoFinding::Diverged {
+                moved_px: moved,
+                limit_px: rules.max_correction_px,
+            });
+        }
+        let warp = (matrix - Matrix2::identity()).amax();
+        if !(warp <= rules.max_affine_change) {
+            return Err(NoFinding::Shape {
+                what: "change of the affine map",
+                found: warp,
+                expected: format!("at most {}", rules.max_affine_change),
+            });
+        }
+        if shift.norm() < SETTLED_PX && change.amax() / scale < 4.0 * SETTLED_PX {
+            let cross = right_side[6] - mean * sum;
+            let variance = squares - sum * sum / n;
+            let score = cross / (patch_variance * variance).max(1e-12).sqrt();
+            let residual = (squares - x.dot(&right_side)).max(0.0) / (n - 8.0).max(1.0);
+            let inverse = factor.inverse();
+            let spread = 0.5 * (inverse[(0, 0)] + inverse[(1, 1)]);
+            // the template carries noise of its own: both images count
+            let sigma = (residual.max(0.08) * spread).sqrt() / gain;
+            let floor = rules.sigma_floor_px;
+            let at = centre + matrix * patch.offset;
+            return Ok(Finding::at(
+                at.x,
+                at.y,
+                score,
+                (sigma * sigma + floor * floor).sqrt(),
+            ));
+        }
+    }
+    Err(NoFinding::Diverged {
+        moved_px: (centre - start).norm(),
+        limit_px: rules.max_correction_px,
+    })
+}
+
+/// Sigma granted to a peak at the image border, which cannot be fitted, px.
+const UNFITTED_SIGMA_PX: f64 = 0.15;
+
+/// A peak so close to the border that the fit has no room: the search's own subpixel result.
+fn border_peak(
+    patch: &Patch,
+    peak: &Peak,
+    variance: f64,
+    rows: &[(usize, SVector<f64, 8>)],
+    rules: &TemplateRules,
+) -> Option<Finding> {
+    let slopes: f64 = rows.iter().map(|(_, r)| r[0] * r[0] + r[1] * r[1]).sum();
+    let noise = variance * (1.0 / (peak.score * peak.score) - 1.0).max(0.0) / rows.len() as f64;
+    let sigma = (noise * 2.0 / slopes.max(1e-9)).sqrt();
+    let sigma = (sigma * sigma + UNFITTED_SIGMA_PX * UNFITTED_SIGMA_PX).sqrt();
+    (sigma <= rules.max_sigma_px).then(|| {
+        Finding::at(
+            peak.u_px + patch.offset.x,
+            peak.v_px + patch.offset.y,
+            peak.score,
+            sigma,
+        )
+    })
+}
+
+/// Largest side of a warped template, px.
+const MAX_SIDE_PX: f64 = 400.0;
+/// Least side, px.
+const MIN_SIDE_PX: f64 = 8.0;
+
+/// The picture as the image should show it, and where its middle should be.
+fn warp(picture: &Image8, appearance: &Appearance) -> Result<(Patch, Vector2<f64>), NoFinding> {
+    let (w, h) = (f64::from(picture.width_px), f64::from(picture.height_px));
+    let bad = |e: &dyn std::fmt::Display| NoFinding::BadInput(format!("appearance: {e}"));
+    let middle = Vector2::new((w - 1.0) / 2.0, (h - 1.0) / 2.0);
+    // picture px (from its middle) to image px
+    let forward = |d: &Vector2<f64>| -> Result<Vector2<f64>, NoFinding> {
+        match appearance {
+            Appearance::Affine {
+                place_px,
+                image_from_picture,
+            } => Ok(place_px + image_from_picture * d),
+            Appearance::Pose {
+                camera,
+                camera_frame_from_picture,
+                width_m,
+            } => {
+                let s = width_m / w;
+                let p = camera_frame_from_picture * Point3::new(d.x * s, -d.y * s, 0.0);
+                camera.project(&p.coords).map_err(|e| bad(&e))
+            }
+        }
+    };
+    let back = |q: &Vector2<f64>| -> Option<Vector2<f64>> {
+        match appearance {
+            Appearance::Affine {
+                place_px,
+                image_from_picture,
+            } => Some(image_from_picture.try_inverse()? * (q - place_px)),
+            Appearance::Pose {
+                camera,
+                camera_frame_from_picture,
+                width_m,
+            } => {
+                let ray = camera.ray(q).ok()?;
+                let o =
+                    camera_frame_from_picture.inverse_transform_point(&Point3::from(ray.origin));
+                let d = camera_frame_from_picture.inverse_transform_vector(ray.direction.as_ref());
+                if !(o.z > 0.0 && d.z < 0.0) {
+                    return None; // the picture's back
+                }
+                let t = -o.z / d.z;
+                let s = w / width_m;
+                Some(Vector2::new((o.x + t * d.x) * s, -(o.y + t * d.y) * s))
+            }
+        }
+    };
+    if let Appearance::Pose { width_m, .. } = appearance {
+        positive("appearance", "width_m", *width_m)?;
+    }
+    let place = forward(&Vector2::zeros())?;
+    let (mut low, mut high) = (place, place);
+    for (x, y) in [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)] {
+        let corner = forward(&Vector2::new(x * w, y * h))?;
+        low = low.inf(&corner);
+        high = high.sup(&corner);
+    }
+    let extent = high - low;
+    if !(extent.max() <= MAX_SIDE_PX) {
+        return Err(bad(&format!(
+            "the picture would be {:.0} x {:.0} px, expected at most {MAX_SIDE_PX} px",
+            extent.x, extent.y
+        )));
+    }
+    if !(extent.min() >= MIN_SIDE_PX) {
+        return Err(NoFinding::TooSmall {
+            found_px: extent.min(),
+            needed_px: MIN_SIDE_PX,
+        });
+    }
+    let (left, top) = (low.x.floor(), low.y.floor());
+    let width = (high.x.ceil() - left) as usize + 1;
+    let height = (high.y.ceil() - top) as usize + 1;
+    // picture px per image px along each image axis, for the averaging
+    let per_px =
+        |d: Vector2<f64>| -> Option<f64> { Some((back(&(place + d))? - back(&place)?).norm()) };
+    let shrink = per_px(Vector2::x())
+        .zip(per_px(Vector2::y()))
+        .map(|(a, b)| a.max(b))
+        .ok_or_else(|| bad(&"the picture shows its back or its edge"))?;
+    let samples = (2.0 * shrink).ceil().clamp(1.0, 8.0) as usize;
+    let spline = SplineImage::new(&ImageF::from_image8(picture)?);
+    let mut values = vec![0.0f32; width * height];
+    let mut mask = vec![false; width * height];
+    for j in 0..height {
+        for i in 0..width {
+            let at = Vector2::new(left + i as f64, top + j as f64);
+            let mut sum = 0.0f32;
+            let mut whole = true;
+            for k in 0..samples * samples {
+                let part = |k: usize| (k as f64 + 0.5) / samples as f64 - 0.5;
+                let q = at + Vector2::new(part(k % samples), part(k / samples));
+                match back(&q).and_then(|d| spline.sample(middle.x + d.x, middle.y + d.y)) {
+                    Some(s) => sum += s.value,
+                    None => whole = false,
+                }
+            }
+            if whole {
+                values[j * width + i] = sum / (samples * samples) as f32;
+                mask[j * width + i] = true;
+            }
+        }
+    }
+    let grid_middle = Vector2::new(
+        left + (width as f64 - 1.0) / 2.0,
+        top + (height as f64 - 1.0) / 2.0,
+    );
+    let patch = Patch {
+        width,
+        height,
+        values,
+        mask: Some(mask),
+        offset: place - grid_middle,
+    };
+    Ok((patch, place))
+}

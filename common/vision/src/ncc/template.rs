@@ -1,0 +1,205 @@
+//! The template: zero-mean values in whole numbers, with a mask.
+
+use super::LANES;
+use crate::image::Image8;
+
+/// Why a template could not be made.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub enum TemplateError {
+    /// Width times height is not the number of values (or of mask entries), or is zero.
+    #[error("a template of {width} x {height} needs as many values and mask entries, got {found}")]
+    WrongLength {
+        /// Stated width, px.
+        width: usize,
+        /// Stated height, px.
+        height: usize,
+        /// Entries given.
+        found: usize,
+    },
+    /// Fewer than two pixels are inside the mask, or too many for exact sums.
+    #[error("a template needs 2 to {limit} pixels inside its mask, got {found}")]
+    BadCount {
+        /// Pixels inside the mask.
+        found: usize,
+        /// Most pixels allowed.
+        limit: usize,
+    },
+    /// The values inside the mask are all equal, or not finite.
+    #[error("the template has no contrast (standard deviation {0}), nothing can be found with it")]
+    NoContrast(f64),
+}
+
+/// A run of masked-in pixels in one template row.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Span {
+    pub row: usize,
+    pub start: usize,
+    pub end: usize,
+}
+
+/// A zero-mean template with a mask, ready for correlation.
+#[derive(Clone, Debug)]
+pub struct Template {
+    pub(super) width: usize,
+    pub(super) height: usize,
+    pub(super) stride: usize,
+    pub(super) values: Vec<i16>,
+    pub(super) spans: Vec<Span>,
+    pub(super) rectangular: bool,
+    pub(super) count: usize,
+    /// Mean of `values` inside the mask.
+    pub(super) mean: f64,
+    pub(super) norm: f64,
+}
+
+/// Rounds half up; the argument is within +-4097.
+#[inline(always)]
+fn round_to_i16(x: f32) -> i16 {
+    ((x + 8192.5) as i32 - 8192) as i16
+}
+
+/// The runs of `true` in each row.
+fn spans_of(mask: &[bool], width: usize) -> Vec<Span> {
+    let mut spans = Vec::new();
+    for (row, line) in mask.chunks_exact(width).enumerate() {
+        let mut start = None;
+        for (column, &on) in line.iter().chain(std::iter::once(&false)).enumerate() {
+            match (on, start) {
+                (true, None) => start = Some(column),
+                (false, Some(first)) => {
+                    spans.push(Span {
+                        row,
+                        start: first,
+                        end: column,
+                    });
+                    start = None;
+                }
+                _ => {}
+            }
+        }
+    }
+    spans
+}
+
+/// Most pixels in a template.
+const MAX_COUNT: usize = 65_536;
+
+impl Template {
+    /// A template of `width` x `height` values (any unit; only contrast counts), row by row.
+    /// Pixels whose mask entry is `false` are ignored.
+    ///
+    /// # Errors
+    /// [`TemplateError`] if the lengths do not fit or there is no contrast.
+    pub fn new(
+        width: usize,
+        height: usize,
+        values: &[f32],
+        mask: Option<&[bool]>,
+    ) -> Result<Self, TemplateError> {
+        let wrong = |found| TemplateError::WrongLength {
+            width,
+            height,
+            found,
+        };
+        if width == 0 || height == 0 || values.len() != width * height {
+            return Err(wrong(values.len()));
+        }
+        if let Some(mask) = mask
+            && mask.len() != values.len()
+        {
+            return Err(wrong(mask.len()));
+        }
+        let inside = |i: usize| mask.is_none_or(|m| m[i]);
+        let count = mask.map_or(values.len(), |m| m.iter().filter(|&&on| on).count());
+        if !(2..=MAX_COUNT).contains(&count) {
+            return Err(TemplateError::BadCount {
+                found: count,
+                limit: MAX_COUNT,
+            });
+        }
+        let chosen = || {
+            values
+                .iter()
+                .enumerate()
+                .filter(|&(i, _)| inside(i))
+                .map(|(_, &x)| x)
+        };
+        let n = count as f64;
+        let mean = chosen().map(f64::from).sum::<f64>() / n;
+        let (mut largest, mut size_sum, mut square_sum) = (0.0f64, 0.0f64, 0.0f64);
+        for x in chosen() {
+            let d = f64::from(x) - mean;
+            largest = largest.max(d.abs());
+            size_sum += d.abs();
+            square_sum += d * d;
+        }
+        let deviation = (square_sum / n).sqrt();
+        if !deviation.is_finite() || deviation <= 1e-6 * (1.0 + mean.abs()) {
+            return Err(TemplateError::NoContrast(deviation));
+        }
+        // |sum of products| must stay below 2^31 for any image
+        let gain = (4096.0 / largest).min(2.0e6 / size_sum) as f32;
+
+        let stride = width.div_ceil(LANES) * LANES;
+        let mut quantised = vec![0i16; stride * height];
+        let (mut sum, mut square) = (0i64, 0i64);
+        let lines = quantised
+            .chunks_exact_mut(stride)
+            .zip(values.chunks_exact(width));
+        for (row, (out, line)) in lines.enumerate() {
+            for (column, (o, &x)) in out.iter_mut().zip(line).enumerate() {
+                if inside(row * width + column) {
+                    let q = round_to_i16((x - mean as f32) * gain);
+                    *o = q;
+                    sum += i64::from(q);
+                    square += i64::from(i32::from(q) * i32::from(q));
+                }
+            }
+        }
+        // Rounding leaves a small mean; the score takes it into account.
+        let norm = (square as f64 - (sum as f64).powi(2) / n).sqrt();
+        Ok(Self {
+            width,
+            height,
+            stride,
+            values: quantised,
+            spans: mask.map_or_else(Vec::new, |m| spans_of(m, width)),
+            rectangular: count == width * height,
+            count,
+            mean: sum as f64 / n,
+            norm,
+        })
+    }
+
+    /// A template cut out of an image: columns `left..left + width`, rows `top..top + height`.
+    ///
+    /// # Errors
+    /// [`TemplateError`] if the window leaves the image (as a wrong length) or has no contrast.
+    pub fn cut(
+        image: &Image8,
+        left: u32,
+        top: u32,
+        width: u32,
+        height: u32,
+    ) -> Result<Self, TemplateError> {
+        let mut values = Vec::with_capacity(width as usize * height as usize);
+        for v in top..top.saturating_add(height) {
+            for u in left..left.saturating_add(width) {
+                values.extend(image.get(u, v).map(f32::from));
+            }
+        }
+        Self::new(width as usize, height as usize, &values, None)
+    }
+
+    /// Width, px.
+    #[must_use]
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
+    /// Height, px.
+    #[must_use]
+    pub fn height(&self) -> usize {
+        self.height
+    }
+}

@@ -1,0 +1,40 @@
+//! `rover vision`: fiducials and stereo on a person's own images.
+
+mod evaluate;
+mod find;
+mod input;
+mod stereo;
+
+use super::{CommandError, Exit};
+
+/// Finds fiducials, matches pixels and measures surfaces in images of one's own
+///
+/// Images are PNG or PGM, 8 or 16 bit; colour is converted to grey. Pixel (0, 0) is the centre of
+/// the first pixel. Camera models are CAHV text files or TOML. Exit code 3: the images hold no
+/// answer, and the output says why.
+#[derive(Clone, Debug, clap::Args)]
+pub struct VisionArgs {
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+#[derive(Clone, Debug, clap::Subcommand)]
+enum Verb {
+    Find(Box<find::FindArgs>),
+    Match(stereo::MatchArgs),
+    Normal(stereo::NormalArgs),
+    Evaluate(evaluate::EvaluateArgs),
+}
+
+/// Runs the command.
+///
+/// # Errors
+/// [`CommandError`].
+pub async fn run(args: VisionArgs) -> Result<Exit, CommandError> {
+    match args.verb {
+        Verb::Find(args) => find::run(&args),
+        Verb::Match(args) => stereo::run_match(&args),
+        Verb::Normal(args) => stereo::run_normal(&args),
+        Verb::Evaluate(args) => evaluate::run(&args),
+    }
+}

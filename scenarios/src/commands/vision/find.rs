@@ -1,0 +1,255 @@
+//! `rover vision find`: one image, one kind of fiducial.
+
+use std::path::PathBuf;
+
+use nalgebra::{Isometry3, Matrix2, Vector2, Vector3};
+use rover_vision::find::{self, Appearance, DiscTruth, Finding, FindingRecord, NoFinding};
+use rover_vision::ncc::Window;
+use rover_vision::{DetectionRules, Image8, PlateLayout};
+use serde::Serialize;
+
+use super::input;
+use crate::commands::{CommandError, Exit};
+use crate::output::Output;
+
+/// Finds a fiducial in an image: position, score, standard deviation, and the pose if it has one
+#[derive(Clone, Debug, clap::Args)]
+pub struct FindArgs {
+    /// Image; `-` is standard input
+    pub image: PathBuf,
+    /// What to look for
+    #[arg(long, value_name = "KIND")]
+    pub fiducial: Kind,
+    /// Searches around this pixel, instead of the whole image
+    #[arg(long, value_name = "U,V", value_parser = input::numbers::<2>, allow_hyphen_values = true)]
+    pub near: Option<[f64; 2]>,
+    /// How far from --near, or from a predicted pose, in u and in v
+    #[arg(long, value_name = "PX", default_value_t = 20.0)]
+    pub radius: f64,
+    /// Picture to look for (template)
+    #[arg(long, value_name = "PNG")]
+    pub template: Option<PathBuf>,
+    /// How the picture appears: the 2 x 2 matrix of image offsets by picture offsets (template,
+    /// with --near)
+    #[arg(long, value_name = "A,B,C,D", value_parser = input::numbers::<4>, allow_hyphen_values = true)]
+    pub warp: Option<[f64; 4]>,
+    /// Camera model (plate; apriltag, disc and template if their pose or plane is to count)
+    #[arg(long, value_name = "FILE")]
+    pub model: Option<PathBuf>,
+    /// Predicted pose in the frame of the camera model: x,y,z in m and quaternion w,x,y,z
+    #[arg(long, value_name = "X,Y,Z,W,I,J,K", value_parser = input::pose, allow_hyphen_values = true)]
+    pub pose: Option<Isometry3<f64>>,
+    /// Width of the picture, of the standard plate, or of a tag's border square
+    #[arg(long, value_name = "M")]
+    pub width_m: Option<f64>,
+    /// Layout of the plate as TOML, instead of the standard one of --width-m
+    #[arg(long, value_name = "FILE")]
+    pub layout: Option<PathBuf>,
+    /// Normal of the disc's plane in the frame of the camera model: the disc's true centre is given
+    #[arg(long, value_name = "X,Y,Z", value_parser = input::vector, allow_hyphen_values = true)]
+    pub normal: Option<Vector3<f64>>,
+    /// Tag family
+    #[arg(long, value_name = "NAME", default_value = "tag36h11")]
+    pub family: String,
+    /// Thresholds of the detector as TOML; what it leaves out keeps its default
+    #[arg(long, value_name = "FILE")]
+    pub rules: Option<PathBuf>,
+    /// Where the JSON goes; `-` is standard output
+    #[arg(long, value_name = "FILE", default_value = "-")]
+    pub json: PathBuf,
+    /// Overwrites an output that exists
+    #[arg(long)]
+    pub force: bool,
+}
+
+/// Kinds of fiducials.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Kind {
+    /// Harris corners
+    Harris,
+    /// A picture, given with --template
+    Template,
+    /// A dark disc (a light one with the rule polarity = "light")
+    Disc,
+    /// The crossing of two edges, as in a checker
+    Saddle,
+    /// The plate of discs and a saddle; gives its pose
+    Plate,
+    /// A tag of --family; gives its pose with --model and --width-m
+    Apriltag,
+}
+
+impl Kind {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Harris => "harris",
+            Self::Template => "template",
+            Self::Disc => "disc",
+            Self::Saddle => "saddle",
+            Self::Plate => "plate",
+            Self::Apriltag => "apriltag",
+        }
+    }
+}
+
+#[derive(Serialize)]
+struct Report {
+    fiducial: &'static str,
+    status: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    refused_by: Option<&'static str>,
+    #[serde(flatten)]
+    best: Option<FindingRecord>,
+    others: Vec<FindingRecord>,
+}
+
+/// Runs the command.
+pub fn run(args: &FindArgs) -> Result<Exit, CommandError> {
+    let out = Output::open(&args.json, args.force)?;
+    let image = input::image(&args.image)?;
+    let fiducial = args.fiducial.name();
+    let (report, exit) = match detect(args, &image)? {
+        Ok(found) => {
+            let mut records = found.iter().map(FindingRecord::from);
+            let best = records.next();
+            let report = Report {
+                fiducial,
+                status: "ok".into(),
+                refused_by: None,
+                best,
+                others: records.collect(),
+            };
+            (report, Exit::Done)
+        }
+        Err(e) if e.is_bad_input() => return Err(CommandError::BadInput(e.to_string())),
+        Err(e) => {
+            eprintln!("rover: no {fiducial} found: {e}");
+            let report = Report {
+                fiducial,
+                status: e.to_string(),
+                refused_by: Some(e.rule()),
+                best: None,
+                others: Vec::new(),
+            };
+            (report, Exit::Aborted)
+        }
+    };
+    input::write_json(&out, &report)?;
+    Ok(exit)
+}
+
+type Found = Result<Vec<Finding>, NoFinding>;
+
+fn detect(args: &FindArgs, image: &Image8) -> Result<Found, CommandError> {
+    let window = match args.near {
+        Some(place) => find::near(image, place, args.radius)
+            .map_err(|e| CommandError::BadInput(format!("--near: {e}")))?,
+        None => Window::whole(image),
+    };
+    let rules = args.rules.as_deref();
+    let camera = |why: &str| -> Result<_, CommandError> {
+        let path = need(args.model.as_deref(), "--model", why)?;
+        input::camera(path, image)
+    };
+    Ok(match args.fiducial {
+        Kind::Harris => find::harris(image, window, &input::rules(rules)?),
+        Kind::Saddle => find::saddle(image, window, &input::rules(rules)?),
+        Kind::Disc => match args.normal {
+            None => find::disc(image, window, &input::rules(rules)?, None),
+            Some(normal) => {
+                let camera = camera("--normal")?;
+                let truth = DiscTruth {
+                    camera: &camera,
+                    normal,
+                };
+                find::disc(image, window, &input::rules(rules)?, Some(&truth))
+            }
+        },
+        Kind::Template => return template(args, image, window),
+        Kind::Plate => {
+            let camera = camera("the plate's pose")?;
+            let layout = match &args.layout {
+                Some(path) => input::toml_file(path)?,
+                None => PlateLayout::standard(*need(
+                    args.width_m.as_ref(),
+                    "--width-m or --layout",
+                    "the plate's size",
+                )?),
+            };
+            if args.near.is_some() {
+                return Err(CommandError::BadInput(
+                    "--near has no meaning for a plate: predict its pose with --pose, or search \
+                     the whole image"
+                        .into(),
+                ));
+            }
+            let rules: DetectionRules = input::rules(rules)?;
+            let prediction = args.pose.as_ref().map(|pose| (pose, args.radius));
+            find::plate(image, &camera, &layout, prediction, &rules).map(|one| vec![one])
+        }
+        Kind::Apriltag => {
+            let rules = input::rules(rules)?;
+            match args.width_m {
+                Some(width_m) => {
+                    let camera = camera("the tag's pose")?;
+                    let size = Some((&camera, width_m));
+                    find::tags(image, window, &args.family, size, &rules)
+                }
+                None => find::tags(image, window, &args.family, None, &rules),
+            }
+        }
+    })
+}
+
+fn template(args: &FindArgs, image: &Image8, window: Window) -> Result<Found, CommandError> {
+    let path = need(
+        args.template.as_deref(),
+        "--template",
+        "the picture to look for",
+    )?;
+    let picture = input::image(path)?;
+    let rules = input::rules(args.rules.as_deref())?;
+    if let Some(pose) = args.pose {
+        let model = need(args.model.as_deref(), "--model", "--pose")?;
+        let camera = input::camera(model, image)?;
+        let appearance = Appearance::Pose {
+            camera: &camera,
+            camera_frame_from_picture: pose,
+            width_m: *need(args.width_m.as_ref(), "--width-m", "--pose")?,
+        };
+        let found = find::warped_template(image, &picture, &appearance, args.radius, &rules);
+        return Ok(found.map(|one| vec![one]));
+    }
+    if let Some([a, b, c, d]) = args.warp {
+        let near = need(args.near.as_ref(), "--near", "--warp")?;
+        let appearance = Appearance::Affine {
+            place_px: Vector2::from(*near),
+            image_from_picture: Matrix2::new(a, b, c, d),
+        };
+        let found = find::warped_template(image, &picture, &appearance, args.radius, &rules);
+        return Ok(found.map(|one| vec![one]));
+    }
+    let window = match args.near {
+        None => window,
+        // the middle stays within the radius, the picture reaches beyond
+        Some([u, v]) => {
+            let (w, h) = (f64::from(picture.width_px), f64::from(picture.height_px));
+            let across = find::near(image, [u, v], args.radius + 0.5 * w);
+            let down = find::near(image, [u, v], args.radius + 0.5 * h);
+            let bad = |e: NoFinding| CommandError::BadInput(format!("--near: {e}"));
+            let (across, down) = (across.map_err(bad)?, down.map_err(bad)?);
+            Window {
+                left: across.left,
+                width: across.width,
+                ..down
+            }
+        }
+    };
+    Ok(find::template(image, &picture, window, &rules).map(|one| vec![one]))
+}
+
+/// An argument that another one calls for.
+fn need<'a, T: ?Sized>(found: Option<&'a T>, name: &str, why: &str) -> Result<&'a T, CommandError> {
+    found
+        .ok_or_else(|| CommandError::BadInput(format!("{name} is missing, it is needed for {why}")))
+}

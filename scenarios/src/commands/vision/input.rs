@@ -1,0 +1,134 @@
+//! Files and numbers that the vision commands take in, and JSON out.
+
+use std::io::Read;
+use std::path::Path;
+
+use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
+use rover_cameras::{Camera, StereoPair, formats};
+use rover_vision::Image8;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use crate::commands::CommandError;
+use crate::output::Output;
+
+/// Reads all of a file; `-` is standard input.
+fn bytes(path: &Path) -> Result<Vec<u8>, CommandError> {
+    let refuse = |e: std::io::Error| CommandError::BadInput(format!("{}: {e}", path.display()));
+    if path == Path::new("-") {
+        let mut all = Vec::new();
+        std::io::stdin().read_to_end(&mut all).map_err(refuse)?;
+        return Ok(all);
+    }
+    std::fs::read(path).map_err(refuse)
+}
+
+fn text(path: &Path) -> Result<String, CommandError> {
+    String::from_utf8(bytes(path)?)
+        .map_err(|_| CommandError::BadInput(format!("{}: not a text in UTF-8", path.display())))
+}
+
+/// Reads an image.
+pub fn image(path: &Path) -> Result<Image8, CommandError> {
+    Image8::decode(&bytes(path)?)
+        .map_err(|e| CommandError::BadInput(format!("{}: {e}", path.display())))
+}
+
+/// Reads a TOML file of rules; the defaults without one.
+pub fn rules<T: DeserializeOwned + Default>(path: Option<&Path>) -> Result<T, CommandError> {
+    path.map_or_else(|| Ok(T::default()), toml_file)
+}
+
+/// Reads a TOML file.
+pub fn toml_file<T: DeserializeOwned>(path: &Path) -> Result<T, CommandError> {
+    toml::from_str(&text(path)?)
+        .map_err(|e| CommandError::BadInput(format!("{}: {e}", path.display())))
+}
+
+/// Reads a camera model. A file without an image size takes that of `image`; another size than the
+/// image's is refused.
+pub fn camera(path: &Path, image: &Image8) -> Result<Camera, CommandError> {
+    let refuse =
+        |e: &dyn std::fmt::Display| CommandError::BadInput(format!("{}: {e}", path.display()));
+    let file: formats::ModelFile = if path.extension().is_some_and(|e| e == "toml") {
+        toml_file(path)?
+    } else {
+        formats::read_text(&text(path)?).map_err(|e| refuse(&e))?
+    };
+    let size = [image.width_px, image.height_px];
+    if let Some(stated) = file.size_px
+        && stated != size
+    {
+        return Err(refuse(&format!(
+            "the model is of {} x {} px, the image has {} x {} px",
+            stated[0], stated[1], size[0], size[1]
+        )));
+    }
+    let camera = Camera {
+        model: file.model,
+        width_px: size[0],
+        height_px: size[1],
+    };
+    camera.validate().map_err(|e| refuse(&e))?;
+    Ok(camera)
+}
+
+/// Reads both models of a stereo pair.
+pub fn pair(
+    models: (&Path, &Path),
+    images: (&Image8, &Image8),
+) -> Result<StereoPair, CommandError> {
+    let pair = StereoPair {
+        left: camera(models.0, images.0)?,
+        right: camera(models.1, images.1)?,
+    };
+    pair.validate()
+        .map_err(|e| CommandError::BadInput(e.to_string()))?;
+    Ok(pair)
+}
+
+/// Comma-separated finite numbers, for an argument.
+pub fn numbers<const N: usize>(found: &str) -> Result<[f64; N], String> {
+    let refuse = || format!("`{found}` is given, {N} finite numbers with commas are expected");
+    let mut all = [0.0; N];
+    let mut parts = found.split(',');
+    for x in &mut all {
+        let part = parts.next().ok_or_else(refuse)?;
+        *x = part.trim().parse().map_err(|_| refuse())?;
+        if !x.is_finite() {
+            return Err(refuse());
+        }
+    }
+    if parts.next().is_some() {
+        return Err(refuse());
+    }
+    Ok(all)
+}
+
+/// A pose argument: x, y, z in m, then the quaternion w, x, y, z.
+pub fn pose(found: &str) -> Result<Isometry3<f64>, String> {
+    let [x, y, z, w, i, j, k] = numbers::<7>(found)?;
+    let q = Quaternion::new(w, i, j, k);
+    if !((q.norm() - 1.0).abs() < 1e-3) {
+        return Err(format!(
+            "the quaternion of `{found}` has length {}, 1 is expected",
+            q.norm()
+        ));
+    }
+    Ok(Isometry3::from_parts(
+        Translation3::new(x, y, z),
+        UnitQuaternion::from_quaternion(q),
+    ))
+}
+
+/// A vector argument.
+pub fn vector(found: &str) -> Result<Vector3<f64>, String> {
+    numbers::<3>(found).map(Vector3::from)
+}
+
+/// Writes a report as JSON.
+pub fn write_json(out: &Output, report: &impl Serialize) -> Result<(), CommandError> {
+    let mut text = serde_json::to_string_pretty(report).map_err(anyhow::Error::from)?;
+    text.push('\n');
+    Ok(out.write(&text)?)
+}
