@@ -300,7 +300,7 @@ fn locality_section(locality: &Locality) -> String {
          <th>intercept, mm</th><th>r2</th><th>at 16 cm, mm</th><th>5 mm at</th><th>field, mm/m</th>\
          <th>with noise, mm/m</th><th>95 % bound held</th></tr>{rows}</table></div>\
          <p>1 deg and 2.5 mm, {} draws, seed {}; the tool points straight down everywhere. The field \
-         is made from six vectors seen along the last 12 cm before the reference place.</p>",
+         is made from six vectors seen on a bent way of about 30 cm to the reference place.</p>",
         verdict(&locality.verdict()),
         locality.trials,
         locality.seed
