@@ -14,6 +14,8 @@ pub enum Which {
     Table1,
     /// One error vector away from the target: the paper's figure 6
     Locality,
+    /// Every method that the paper names, under the same truths and noise
+    Compare,
     /// All of them in one report
     All,
 }
@@ -99,6 +101,14 @@ fn study(args: &StudyArgs) -> Result<StudyReport, StudyError> {
     if all || args.which == Which::Locality {
         let trials = config(study::locality::PAPER_TRIALS);
         report.locality = Some(study::locality::locality(&trials)?);
+    }
+    if all || args.which == Which::Compare {
+        let trials = config(study::compare::TRIALS);
+        report.compare = Some(study::compare::compare(
+            &trials,
+            &study::compare::Case::ALL,
+            &study::compare::OCCLUSIONS_CM,
+        )?);
     }
     Ok(report)
 }
