@@ -10,6 +10,7 @@
 pub mod align;
 pub mod error;
 pub mod filter;
+pub mod first_ray;
 pub mod handover;
 pub mod patch;
 pub mod relief;

@@ -6,6 +6,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use rover_approach::filter::{OdometryModel, TargetEstimate};
+use rover_approach::first_ray::{FirstRayRules, first_ray};
 use rover_approach::handover::{HandoverRules, hand_over};
 use rover_approach::track::{TrackRules, Tracker};
 use std::sync::Arc;
@@ -146,7 +147,7 @@ pub fn approach(
 
     // designation: the nearest whole pixel to the drawn point, and what that pixel truly sees
     let aim = stage.target + noise.vector(0.002 * range_m);
-    let believed = mast_pair(&in_frame(&belief.isometry(), &aim));
+    let believed = mast_pair(&in_frame(&belief.isometry(), &aim), false);
     let true_pair = |believed: &rover_cameras::StereoPair, truth: &Pose, noise: &mut Noise| {
         believed.transformed(&(truth.isometry() * pointing_error(noise.vector(rules.pointing_rad))))
     };
@@ -199,7 +200,8 @@ pub fn approach(
         belief.pitch = truth.pitch + noise.draw(model.tilt_rad);
         let motion = model.motion(&before, &belief.isometry());
         estimate = estimate.predicted(&motion);
-        let believed = mast_pair(&estimate.position_m);
+        let whole = estimate.position_m.xy().norm() <= rules.end_m + 0.05;
+        let believed = mast_pair(&estimate.position_m, whole);
         let cameras = true_pair(&believed, &truth, &mut noise);
         let view = Arc::new(stage.take(&cameras, &believed)?);
         let pointing_px = 1290.0 * rules.pointing_rad * 1.5;
@@ -233,13 +235,21 @@ pub fn approach(
     let (pixel, surface) = tracker.target();
     let seen = stage.cast(&cameras.left, pixel).ok_or("nothing under the tracked pixel")?;
     let surface_mm = (seen.point - target).norm() * 1e3;
+    let near = first_ray(&tracker, &view, &FirstRayRules::default());
+    let met = near.as_ref().ok().and_then(|near| {
+        let seen = stage.cast(&cameras.left, &near.pixel_px)?;
+        Some((seen.point - target).norm() * 1e3)
+    });
+    if std::env::var_os("APPROACH_DEBUG").is_some() {
+        eprintln!("      tracked {surface_mm:.2} mm, first ray {met:?}: {near:?}");
+    }
     let body_believed = body_pair();
     let body_true = body_believed.transformed(&(truth.isometry() * mount));
     let body = stage.take(&body_true, &body_believed)?;
     let mut tracked = Tracked {
         surface_mm,
-        first_ray_mm: None,
-        decided_mm: surface_mm,
+        first_ray_mm: met,
+        decided_mm: met.unwrap_or(surface_mm),
         handed: None,
         not_handed: None,
     };

@@ -18,6 +18,8 @@ const MAST_FOCAL_PX: f64 = 1290.0;
 const BODY_FOCAL_PX: f64 = 602.0;
 /// Size of the rendered part of the mast images, px.
 const MAST_CROP: [u32; 2] = [440, 260];
+/// Size of the whole mast images, px.
+const MAST_SIZE: [u32; 2] = [1024, 768];
 const MAST_BASELINE_M: f64 = 0.20;
 const MAST_HEIGHT_M: f64 = 1.2;
 
@@ -190,14 +192,15 @@ fn camera(
     }
 }
 
-/// The mast pair aimed at a point of the rover frame: the part of the images about it.
-pub fn mast_pair(aim: &Vector3<f64>) -> StereoPair {
+/// The mast pair aimed at a point of the rover frame: the whole images or the part about it.
+pub fn mast_pair(aim: &Vector3<f64>, whole: bool) -> StereoPair {
+    let size = if whole { MAST_SIZE } else { MAST_CROP };
     let centre = Vector3::new(0.0, 0.0, MAST_HEIGHT_M);
     let axis = (aim - centre).normalize();
     let right = axis.cross(&Vector3::z()).normalize() * (0.5 * MAST_BASELINE_M);
-    let [u0, v0] = MAST_CROP.map(|n| (f64::from(n) - 1.0) / 2.0);
+    let [u0, v0] = size.map(|n| (f64::from(n) - 1.0) / 2.0);
     let shift = (MAST_FOCAL_PX * 0.5 * MAST_BASELINE_M / (aim - centre).norm()).round();
-    let at = |c, u| camera(c, axis, MAST_FOCAL_PX, [u, v0], MAST_CROP);
+    let at = |c, u| camera(c, axis, MAST_FOCAL_PX, [u, v0], size);
     StereoPair {
         left: at(centre - right, u0 - shift),
         right: at(centre + right, u0 + shift),
