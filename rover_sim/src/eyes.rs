@@ -152,6 +152,8 @@ impl Eyes {
             step: moment.step,
             left: image(left),
             right: image(right),
+            mast: None,
+            wheels: None,
         })
     }
 
