@@ -33,6 +33,10 @@ pub const SERVO_PLACE: &str = "servo/place";
 pub const CONTACT_APPROACH: &str = "contact/approach";
 /// Scores a placement against the truth; simulator only, query.
 pub const SIM_TRUTH_SCORE: &str = "sim/truth/score";
+/// Remembers the true surface point of a pixel; simulator only, query.
+pub const SIM_TRUTH_DESIGNATE: &str = "sim/truth/designate";
+/// A place that a person might choose as a target; simulator only, query.
+pub const SIM_TRUTH_PICK: &str = "sim/truth/pick";
 /// What the simulator knows about the truth of this run; simulator only, query.
 pub const SIM_TRUTH_STATE: &str = "sim/truth/state";
 /// A view of the scene from an outside camera; simulator only, query.
