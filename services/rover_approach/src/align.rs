@@ -90,9 +90,8 @@ fn weights(half: HalfSize) -> Vec<f64> {
 
 /// Normalises the inner part (a margin of one pixel left out) of a patch.
 fn normalised(patch: &Patch, weights: &[f64]) -> Normalised {
-    let inner = (1..patch.half.rows() - 1).flat_map(|j| {
-        (1..patch.half.columns() - 1).map(move |i| patch.at(i, j))
-    });
+    let inner = (1..patch.half.rows() - 1)
+        .flat_map(|j| (1..patch.half.columns() - 1).map(move |i| patch.at(i, j)));
     let values: Vec<f64> = inner.collect();
     let mean: f64 = values.iter().zip(weights).map(|(x, w)| x * w).sum();
     let variance: f64 = values
@@ -126,14 +125,13 @@ impl Template {
         pixel_px: &Vector2<f64>,
         half: HalfSize,
     ) -> Result<Self, TrackError> {
-        let patch = Patch::cut(image, pixel_px, half.grown(1)).ok_or_else(|| {
-            TrackError::OutsideImage {
+        let patch =
+            Patch::cut(image, pixel_px, half.grown(1)).ok_or_else(|| TrackError::OutsideImage {
                 u_px: pixel_px.x,
                 v_px: pixel_px.y,
                 columns: half.columns() + 2,
                 rows: half.rows() + 2,
-            }
-        })?;
+            })?;
         let weights = weights(half);
         let normal = normalised(&patch, &weights);
         Ok(Self {
@@ -294,10 +292,7 @@ impl Template {
                     + (patch.at(i + 2, j + 1) - patch.at(i, j + 1)) * cs;
                 let dv = (self.patch.at(i + 1, j + 2) - self.patch.at(i + 1, j)) * ct
                     + (patch.at(i + 1, j + 2) - patch.at(i + 1, j)) * cs;
-                let (u, v) = (
-                    i as f64 - self.half.u as f64,
-                    j as f64 - self.half.v as f64,
-                );
+                let (u, v) = (i as f64 - self.half.u as f64, j as f64 - self.half.v as f64);
                 let row = [du, dv, du * u, du * v, dv * u, dv * v];
                 let e = seen.values[k] - self.normal.values[k];
                 let w = self.weights[k];

@@ -80,8 +80,10 @@ pub enum TrackError {
         limit_px: f64,
     },
     /// Two independent matches disagree.
-    #[error("matches from the left and the right mast camera differ by {distance_px:.2} px, limit \
-             {limit_px}")]
+    #[error(
+        "matches from the left and the right mast camera differ by {distance_px:.2} px, limit \
+             {limit_px}"
+    )]
     SidesDisagree {
         /// Distance, px.
         distance_px: f64,

@@ -6,7 +6,7 @@
 //! believed pose whenever somebody wants one.
 
 use crate::error::TrackError;
-use nalgebra::{Isometry3, Matrix2, Matrix3, Point3, Vector3};
+use nalgebra::{Isometry3, Matrix2, Matrix3, Matrix6, Point3, SMatrix, Vector3, Vector6};
 use rover_cameras::Camera;
 
 /// One step of the rover as odometry and attitude sensor tell it.
@@ -14,10 +14,43 @@ use rover_cameras::Camera;
 pub struct Motion {
     /// Last stop's rover frame to the present one's.
     pub now_from_last: Isometry3<f64>,
-    /// Covariance of the translation, present rover frame, m^2.
-    pub translation_m2: Matrix3<f64>,
-    /// Covariance of the rotation (rotation vector, present rover frame), rad^2.
-    pub rotation_rad2: Matrix3<f64>,
+    /// Covariance of translation (m) and rotation vector (rad) of that transform, present rover
+    /// frame.
+    pub covariance: Matrix6<f64>,
+}
+
+impl Motion {
+    /// A motion with the covariance of (along, across, heading) of the drive, in the axes of its
+    /// start (m^2, m rad, rad^2), and the standard deviation of roll and pitch at one stop, rad.
+    #[must_use]
+    pub fn from_drive(
+        now_from_last: Isometry3<f64>,
+        drive: &[[f64; 3]; 3],
+        tilt_sigma_rad: f64,
+    ) -> Self {
+        let turn = now_from_last.rotation;
+        // what the rover did more, the target does less; the same sign for all three
+        let along = turn * Vector3::x();
+        let across = turn * Vector3::y();
+        let mut shape = SMatrix::<f64, 6, 3>::zeros();
+        shape.fixed_view_mut::<3, 1>(0, 0).copy_from(&along);
+        shape.fixed_view_mut::<3, 1>(0, 1).copy_from(&across);
+        shape[(5, 2)] = 1.0;
+        let drive = Matrix3::from_fn(|i, j| drive[i][j]);
+        let mut covariance = shape * drive * shape.transpose();
+        let tilt = 2.0 * tilt_sigma_rad * tilt_sigma_rad;
+        covariance[(2, 2)] += 0.01 * 0.01 * now_from_last.translation.vector.norm_squared();
+        for (k, floor) in [1e-8, 1e-8, 1e-8, tilt, tilt, 1e-10]
+            .into_iter()
+            .enumerate()
+        {
+            covariance[(k, k)] += floor;
+        }
+        Self {
+            now_from_last,
+            covariance,
+        }
+    }
 }
 
 /// How good odometry and attitude sensor are, one sigma.
@@ -62,10 +95,10 @@ impl OdometryModel {
         // the two attitudes are independent of each other
         let tilt = 2.0 * self.tilt_rad.powi(2);
         let heading = self.heading_rad_per_root_m.powi(2) * step_m + 1e-10;
+        let diagonal = Vector6::new(along, across, vertical, tilt, tilt, heading);
         Motion {
             now_from_last,
-            translation_m2: Matrix3::from_diagonal(&Vector3::new(along, across, vertical)),
-            rotation_rad2: Matrix3::from_diagonal(&Vector3::new(tilt, tilt, heading)),
+            covariance: Matrix6::from_diagonal(&diagonal),
         }
     }
 }
@@ -94,11 +127,11 @@ impl TargetEstimate {
     /// # Errors
     /// [`TrackError::BadInput`] unless everything is finite and the covariance has a positive
     /// diagonal.
-    pub fn new(
-        position_m: Vector3<f64>,
-        covariance_m2: Matrix3<f64>,
-    ) -> Result<Self, TrackError> {
-        let finite = position_m.iter().chain(&covariance_m2).all(|x| x.is_finite());
+    pub fn new(position_m: Vector3<f64>, covariance_m2: Matrix3<f64>) -> Result<Self, TrackError> {
+        let finite = position_m
+            .iter()
+            .chain(&covariance_m2)
+            .all(|x| x.is_finite());
         if finite && covariance_m2.diagonal().iter().all(|x| *x > 0.0) {
             return Ok(Self {
                 position_m,
@@ -117,10 +150,13 @@ impl TargetEstimate {
     pub fn predicted(&self, motion: &Motion) -> Self {
         let r = motion.now_from_last.rotation.to_rotation_matrix();
         let position_m = (motion.now_from_last * Point3::from(self.position_m)).coords;
-        let lever = position_m.cross_matrix();
-        let covariance_m2 = r * self.covariance_m2 * r.transpose()
-            + motion.translation_m2
-            + lever * motion.rotation_rad2 * lever.transpose();
+        let mut shift = SMatrix::<f64, 3, 6>::zeros();
+        shift.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
+        shift
+            .fixed_view_mut::<3, 3>(0, 3)
+            .copy_from(&-position_m.cross_matrix());
+        let covariance_m2 =
+            r * self.covariance_m2 * r.transpose() + shift * motion.covariance * shift.transpose();
         Self {
             position_m,
             covariance_m2,
@@ -131,7 +167,10 @@ impl TargetEstimate {
     /// pointing error (px, one sigma) in it; `None` if the camera cannot see the point.
     #[must_use]
     pub fn pixel_covariance(&self, camera: &Camera, pointing_px: f64) -> Option<Matrix2<f64>> {
-        let j = camera.project_with_jacobian(&self.position_m).ok()?.jacobian;
+        let j = camera
+            .project_with_jacobian(&self.position_m)
+            .ok()?
+            .jacobian;
         let spread = j * self.covariance_m2 * j.transpose()
             + Matrix2::identity() * (pointing_px * pointing_px);
         spread.iter().all(|x| x.is_finite()).then_some(spread)
@@ -198,11 +237,8 @@ mod tests {
         let predicted = start.predicted(&motion);
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(5);
         let root = |m: &Matrix3<f64>| m.cholesky().unwrap().l();
-        let (p, t, r) = (
-            root(&start.covariance_m2),
-            root(&motion.translation_m2),
-            root(&motion.rotation_rad2),
-        );
+        let part = |at: usize| motion.covariance.fixed_view::<3, 3>(at, at).into_owned();
+        let (p, t, r) = (root(&start.covariance_m2), root(&part(0)), root(&part(3)));
         let n = 40_000;
         let mut sum = Matrix3::zeros();
         for _ in 0..n {

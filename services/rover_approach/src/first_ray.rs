@@ -151,21 +151,20 @@ impl NearMap {
         })
     }
 
-    /// Height at a pixel of the near image.
-    fn height(&self, pixel: &Vector2<f64>) -> Option<f64> {
+    /// Height at a pixel of the near image; beyond the map that of its edge, which lines of sight
+    /// pass only well above the surface.
+    fn height(&self, pixel: &Vector2<f64>) -> f64 {
         let place = |k: usize| {
             let x = (pixel[k] - self.centre_px[k]) / self.step[k] + (self.size[k] / 2) as f64;
-            let last = self.size[k] as f64 - 1.0;
-            (x >= 0.0 && x <= last).then(|| {
-                let i = (x as usize).min(self.size[k] - 2);
-                (i, x - i as f64)
-            })
+            let x = x.clamp(0.0, self.size[k] as f64 - 1.0);
+            let i = (x as usize).min(self.size[k] - 2);
+            (i, x - i as f64)
         };
-        let ((i, fu), (j, fv)) = (place(0)?, place(1)?);
+        let ((i, fu), (j, fv)) = (place(0), place(1));
         let at = |i: usize, j: usize| self.heights_m[j * self.size[0] + i];
         let top = at(i, j) * (1.0 - fu) + at(i + 1, j) * fu;
         let bottom = at(i, j + 1) * (1.0 - fu) + at(i + 1, j + 1) * fu;
-        Some(top * (1.0 - fv) + bottom * fv)
+        top * (1.0 - fv) + bottom * fv
     }
 
     /// Where the line of sight from `eye` through `on_plane` (a point of the plane) first meets
@@ -187,7 +186,7 @@ impl NearMap {
         let above = |h: f64| -> Option<(f64, Vector2<f64>, Vector3<f64>)> {
             let point = at(h);
             let pixel = near.project(&point).ok()?;
-            Some((h - self.height(&pixel)?, pixel, point))
+            Some((h - self.height(&pixel), pixel, point))
         };
         let mut high = self.limit_m;
         let mut over = above(high)?.0;
@@ -209,7 +208,11 @@ impl NearMap {
                         break;
                     }
                 }
-                let best = if fa == fb { b } else { a - fa * (b - a) / (fb - fa) };
+                let best = if fa == fb {
+                    b
+                } else {
+                    a - fa * (b - a) / (fb - fa)
+                };
                 let (_, pixel, point) = above(best)?;
                 return Some((pixel, point));
             }
@@ -299,8 +302,8 @@ pub fn first_ray(
             expected: format!("at least {}", rules.min_coverage),
         });
     }
-    let eye = first.anchor_from_rover.inverse()
-        * Point3::from(*first.view.cameras.left.model.cahv()[0]);
+    let eye =
+        first.anchor_from_rover.inverse() * Point3::from(*first.view.cameras.left.model.cahv()[0]);
     let scene = Scene {
         view,
         map: &map,
@@ -363,7 +366,11 @@ impl Scene<'_> {
         /// Most sub-samples per first pixel and direction.
         const MOST: f64 = 12.0;
         // every second near pixel is enough: the lens joins them
-        let count = |k: usize| (self.footprint.column(k).norm() / 1.5).ceil().clamp(1.0, MOST);
+        let count = |k: usize| {
+            (self.footprint.column(k).norm() / 1.5)
+                .ceil()
+                .clamp(1.0, MOST)
+        };
         let (nu, nv) = (count(0), count(1));
         let (hu, hv) = (half.u as i64, half.v as i64);
         let mut values = Vec::with_capacity(half.columns() * half.rows());
@@ -372,10 +379,8 @@ impl Scene<'_> {
                 let (mut sum, mut n) = (0.0, 0.0);
                 for j in 0..nv as usize {
                     for i in 0..nu as usize {
-                        let part = Vector2::new(
-                            (i as f64 + 0.5) / nu - 0.5,
-                            (j as f64 + 0.5) / nv - 0.5,
-                        );
+                        let part =
+                            Vector2::new((i as f64 + 0.5) / nu - 0.5, (j as f64 + 0.5) / nv - 0.5);
                         let d = shift + turn * (Vector2::new(u as f64, v as f64) + part);
                         if let Some((q, _)) = self.meet(&d)
                             && let Some(sample) = self.view.left.sample(q.x, q.y)

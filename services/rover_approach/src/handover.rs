@@ -94,7 +94,14 @@ pub fn hand_over(
     let geometric_px = camera
         .project(&surface.plane.point)
         .map_err(|_| TrackError::NotVisible)?;
-    let from_left = find(&mast.left, &mast.cameras.left, mast_px, surface, body, rules)?;
+    let from_left = find(
+        &mast.left,
+        &mast.cameras.left,
+        mast_px,
+        surface,
+        body,
+        rules,
+    )?;
     let distance_px = (from_left.pixel_px - geometric_px).norm();
     if !(distance_px <= rules.gate_px) {
         return Err(TrackError::OffGeometry {
@@ -113,7 +120,15 @@ pub fn hand_over(
     let mast_right = mast.cameras.right.project(&surface.plane.point).ok();
     let sides_px = mast_right
         .and_then(|pixel| {
-            find(&mast.right, &mast.cameras.right, &pixel, surface, body, rules).ok()
+            find(
+                &mast.right,
+                &mast.cameras.right,
+                &pixel,
+                surface,
+                body,
+                rules,
+            )
+            .ok()
         })
         .map(|right| (right.pixel_px - from_left.pixel_px).norm());
     if let Some(distance_px) = sides_px

@@ -1,19 +1,28 @@
-//! Approach to a designated target: keep it in sight, drive to it, hand it over to the body
-//! cameras.
+//! Approach to a designated target: keep it in sight, drive to it, choose where to stand, hand it
+//! over to the body cameras.
 //!
-//! The algorithm files know no bus and no clock: `track` finds the target again in each new image
-//! (`warp`, `patch`, `align`, `surface`, `relief`).
+//! The algorithm files know no bus and no clock. `track` finds the target again in each new image
+//! (`warp`, `patch`, `align`, `surface`, `relief`), `filter` carries its position, `first_ray` meets
+//! the ray first designated with the near map, `handover` goes over to the body pair; `obstacles`
+//! and `drive` find the way, `base_pose` the place to stand. `service` puts them on the bus.
 
 // `!(x >= limit)` refuses a NaN as well, which `x < limit` would let through
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
 pub mod align;
+pub mod base_pose;
+pub mod drive;
 pub mod error;
 pub mod filter;
 pub mod first_ray;
 pub mod handover;
+mod hardware;
+pub mod obstacles;
 pub mod patch;
 pub mod relief;
+mod report;
+pub mod service;
+mod session;
 pub mod surface;
 pub mod track;
 pub mod view;

@@ -119,7 +119,9 @@ fn plane_of(view: &View, found: &StereoMatch, rules: &PlaneRules) -> Option<Ster
     // what moves both pixels alike is lateral, what moves one against the other is range
     let both = to_left + to_right;
     let covariance_m2 = both * (Matrix2::identity() * lateral) * both.transpose()
-        + to_right * (Matrix2::identity() * found.sigma_px.max(0.03).powi(2)) * to_right.transpose();
+        + to_right
+            * (Matrix2::identity() * found.sigma_px.max(0.03).powi(2))
+            * to_right.transpose();
     Some(StereoPlane {
         plane: SurfacePlane { point, normal },
         range_m: found.range_m,

@@ -19,13 +19,17 @@ fn main() -> Result<(), AnyError> {
     let runs: u64 = arguments.next().map_or(Ok(30), |n| n.parse())?;
     let mut classes: Vec<String> = arguments.collect();
     if classes.is_empty() {
-        classes = ["rock10", "rock8", "rock5", "ground5", "ground3"].map(String::from).into();
+        classes = ["rock10", "rock8", "rock5", "ground5", "ground3"]
+            .map(String::from)
+            .into();
     }
     for class in &classes {
         let (kind, range) = match (class.strip_prefix("rock"), class.strip_prefix("ground")) {
             (Some(range), _) => (Kind::Rock, range.parse()?),
             (_, Some(range)) => (Kind::Ground, range.parse()?),
-            _ => return Err(format!("class `{class}`, expected rock10, ground5 or the like").into()),
+            _ => {
+                return Err(format!("class `{class}`, expected rock10, ground5 or the like").into());
+            }
         };
         let mut outcomes = Vec::new();
         for seed in 0..runs {
@@ -45,26 +49,54 @@ fn quantiles(values: impl Iterator<Item = f64>) -> String {
         return "none".into();
     }
     let at = |q: f64| v[((v.len() - 1) as f64 * q).round() as usize];
-    format!("{:.2}/{:.2}/{:.2} (n {})", at(0.5), at(0.95), at(1.0), v.len())
+    format!(
+        "{:.2}/{:.2}/{:.2} (n {})",
+        at(0.5),
+        at(0.95),
+        at(1.0),
+        v.len()
+    )
 }
 
 fn summarise(class: &str, outcomes: &[Outcome]) {
     let done: Vec<_> = outcomes.iter().filter_map(|o| o.tracked.as_ref()).collect();
     let handed: Vec<_> = done.iter().filter_map(|t| t.handed.as_ref()).collect();
-    eprintln!("{class}: {} runs, {} refused", outcomes.len(), outcomes.len() - done.len());
+    eprintln!(
+        "{class}: {} runs, {} refused",
+        outcomes.len(),
+        outcomes.len() - done.len()
+    );
     eprintln!(
         "  silent false locks (> 50 mm): {}",
         done.iter().filter(|t| t.surface_mm > 50.0).count()
     );
     for (name, values) in [
         ("tracked, mm", quantiles(done.iter().map(|t| t.surface_mm))),
-        ("first ray, mm", quantiles(done.iter().filter_map(|t| t.first_ray_mm))),
-        ("first ray or tracked as decided, mm", quantiles(done.iter().map(|t| t.decided_mm))),
+        (
+            "first ray, mm",
+            quantiles(done.iter().filter_map(|t| t.first_ray_mm)),
+        ),
+        (
+            "first ray or tracked as decided, mm",
+            quantiles(done.iter().map(|t| t.decided_mm)),
+        ),
         ("hand-over, px", quantiles(handed.iter().map(|h| h.own_px))),
-        ("by geometry, px", quantiles(handed.iter().map(|h| h.geometric_px))),
-        ("after hand-over, mm", quantiles(handed.iter().map(|h| h.surface_mm))),
-        ("after hand-over in space, mm", quantiles(handed.iter().map(|h| h.space_mm))),
-        ("sigma predicted, mm", quantiles(handed.iter().map(|h| h.sigma_mm))),
+        (
+            "by geometry, px",
+            quantiles(handed.iter().map(|h| h.geometric_px)),
+        ),
+        (
+            "after hand-over, mm",
+            quantiles(handed.iter().map(|h| h.surface_mm)),
+        ),
+        (
+            "after hand-over in space, mm",
+            quantiles(handed.iter().map(|h| h.space_mm)),
+        ),
+        (
+            "sigma predicted, mm",
+            quantiles(handed.iter().map(|h| h.sigma_mm)),
+        ),
     ] {
         eprintln!("  {name}: median/95 %/max {values}");
     }

@@ -141,9 +141,8 @@ pub fn approach(
         pitch: 0.0,
     };
     let (mut truth, mut belief) = (still, still);
-    let in_frame = |pose: &Isometry3<f64>, p: &Vector3<f64>| {
-        (pose.inverse() * Point3::from(*p)).coords
-    };
+    let in_frame =
+        |pose: &Isometry3<f64>, p: &Vector3<f64>| (pose.inverse() * Point3::from(*p)).coords;
 
     // designation: the nearest whole pixel to the drawn point, and what that pixel truly sees
     let aim = stage.target + noise.vector(0.002 * range_m);
@@ -153,7 +152,9 @@ pub fn approach(
     };
     let cameras = true_pair(&believed, &truth, &mut noise);
     let designated = cameras.left.project(&stage.target)?.map(f64::round);
-    let hit = stage.cast(&cameras.left, &designated).ok_or("nothing at the designated pixel")?;
+    let hit = stage
+        .cast(&cameras.left, &designated)
+        .ok_or("nothing at the designated pixel")?;
     let target = hit.point;
     let view = Arc::new(stage.take(&cameras, &believed)?);
     let mut outcome = Outcome {
@@ -217,8 +218,7 @@ pub fn approach(
                 return Ok(outcome);
             }
         };
-        let innovation =
-            estimate.update(&fix.surface.plane.point, &fix.surface.covariance_m2)?;
+        let innovation = estimate.update(&fix.surface.plane.point, &fix.surface.covariance_m2)?;
         let error = stage
             .cast(&cameras.left, &fix.pixel_px)
             .map_or(f64::NAN, |h| (h.point - target).norm() * 1e3);
@@ -233,7 +233,9 @@ pub fn approach(
     }
     let (view, cameras) = last;
     let (pixel, surface) = tracker.target();
-    let seen = stage.cast(&cameras.left, pixel).ok_or("nothing under the tracked pixel")?;
+    let seen = stage
+        .cast(&cameras.left, pixel)
+        .ok_or("nothing under the tracked pixel")?;
     let surface_mm = (seen.point - target).norm() * 1e3;
     let near = first_ray(&tracker, &view, &FirstRayRules::default());
     let met = near.as_ref().ok().and_then(|near| {

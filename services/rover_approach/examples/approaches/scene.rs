@@ -61,7 +61,12 @@ pub enum Kind {
 
 impl Stage {
     /// A scene with a target at `range_m` from the origin, visible from the mast there.
-    pub fn new(kind: Kind, range_m: f64, seed: u64, rng: &mut ChaCha8Rng) -> Result<Self, AnyError> {
+    pub fn new(
+        kind: Kind,
+        range_m: f64,
+        seed: u64,
+        rng: &mut ChaCha8Rng,
+    ) -> Result<Self, AnyError> {
         let ground = shapes::heightfield_mesh(
             &lines(range_m, 0.9, 14.0),
             &lines(0.0, 0.7, 12.0),
@@ -155,11 +160,12 @@ impl Stage {
             pattern_visible: false,
         };
         self.frames += 1;
-        let (a, b) = self.renderer.render_pair(left, right, &state, self.frames)?;
+        let (a, b) = self
+            .renderer
+            .render_pair(left, right, &state, self.frames)?;
         Ok(View::new(prepared(a)?, prepared(b)?, believed.clone())?)
     }
 }
-
 
 fn prepared(image: Grey8) -> Result<PreparedImage, AnyError> {
     let image = Image8 {
