@@ -4,7 +4,8 @@
 //! The algorithm files know no bus and no clock. `track` finds the target again in each new image
 //! (`warp`, `patch`, `align`, `surface`, `relief`), `filter` carries its position, `first_ray` meets
 //! the ray first designated with the near map, `handover` goes over to the body pair; `obstacles`
-//! and `drive` find the way, `base_pose` the place to stand. `service` puts them on the bus.
+//! and `drive` find the way, `base_pose` the place to stand. `service` puts them on the bus; without the feature
+//! `bus` the algorithms build alone.
 
 // `!(x >= limit)` refuses a NaN as well, which `x < limit` would let through
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
@@ -16,12 +17,16 @@ pub mod error;
 pub mod filter;
 pub mod first_ray;
 pub mod handover;
+#[cfg(feature = "bus")]
 mod hardware;
 pub mod obstacles;
 pub mod patch;
 pub mod relief;
+#[cfg(feature = "bus")]
 mod report;
+#[cfg(feature = "bus")]
 pub mod service;
+#[cfg(feature = "bus")]
 mod session;
 pub mod surface;
 pub mod track;

@@ -28,7 +28,9 @@ fn main() -> Result<(), AnyError> {
             (Some(range), _) => (Kind::Rock, range.parse()?),
             (_, Some(range)) => (Kind::Ground, range.parse()?),
             _ => {
-                return Err(format!("class `{class}`, expected rock10, ground5 or the like").into());
+                return Err(
+                    format!("class `{class}`, expected rock10, ground5 or the like").into(),
+                );
             }
         };
         let mut outcomes = Vec::new();
