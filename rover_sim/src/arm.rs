@@ -11,6 +11,7 @@ use crate::{
     contact_switch::Plunger,
     convert::{isometry, pose, vector},
     description::ContactDescription,
+    standing::{Base, Standing},
 };
 use nalgebra::{Isometry3, Point3, Unit, Vector3};
 use rapier3d::prelude as rp;
@@ -31,8 +32,10 @@ pub(crate) const PLUNGER: rp::Group = rp::Group::GROUP_4;
 pub struct ArmModel {
     /// Kinematics.
     pub arm: Arm,
-    /// Pose of the base, world frame.
+    /// Pose of the base, world frame; of a rover that stands as the wheels left it.
     pub world_from_base: Isometry3<f64>,
+    /// The rover that carries the base; `None` if it is fixed to the world.
+    pub standing: Option<Standing>,
     /// Mass, compliance and torque of each joint and its link.
     pub links: Vec<LinkDynamics>,
     /// Shape of each link, link frame.
@@ -60,7 +63,7 @@ pub struct StaticSurface<'a> {
     pub name: String,
     /// Vertices, m.
     pub positions: &'a [Vector3<f64>],
-    /// Triangles, counter-clockwise from outside.
+    /// Triangles, counter-clockwise from outside; none for a body that is out of reach.
     pub triangles: &'a [[u32; 3]],
 }
 
@@ -93,6 +96,7 @@ pub struct ArmPhysics {
     plunger: Plunger,
     statics: Vec<Option<rp::ColliderHandle>>,
     world_from_base: Isometry3<f64>,
+    base: Option<Base>,
     tip_in_link: Vector3<f64>,
     stiffness_nm_rad: Vec<f64>,
 }
@@ -114,17 +118,28 @@ impl ArmPhysics {
         let statics = surfaces
             .iter()
             .map(|s| {
-                Ok(Some(
-                    world.insert_collider(surface_collider(s, model)?, None),
-                ))
+                if s.triangles.is_empty() {
+                    return Ok(None);
+                }
+                let collider = surface_collider(s, model)?;
+                Ok(Some(world.insert_collider(collider, None)))
             })
             .collect::<Result<_, SimulationError>>()?;
         for capsule in &model.body {
             let groups = groups(BODY, LINKS | PLUNGER);
             world.insert_collider(capsule_collider(capsule, groups, model), None);
         }
-        let base =
-            world.insert_body(rp::RigidBodyBuilder::fixed().pose(pose(&model.world_from_base)));
+        let base = model
+            .standing
+            .as_ref()
+            .map(|standing| standing.insert(&mut world, model))
+            .transpose()?;
+        let root = match &base {
+            Some(base) => base.body,
+            None => {
+                world.insert_body(rp::RigidBodyBuilder::fixed().pose(pose(&model.world_from_base)))
+            }
+        };
         let mut arm = Self {
             joints: Vec::new(),
             links: Vec::new(),
@@ -132,11 +147,12 @@ impl ArmPhysics {
             plunger: Plunger::default(),
             statics,
             world_from_base: model.world_from_base,
+            base,
             tip_in_link: model.tip_in_link,
             stiffness_nm_rad: model.links.iter().map(|l| l.stiffness_nm_rad).collect(),
             world,
         };
-        let mut parent = base;
+        let mut parent = root;
         for i in 0..model.links.len() {
             parent = arm.insert_link(model, i, parent);
         }
@@ -173,7 +189,10 @@ impl ArmPhysics {
                 .push((i, self.world.insert_collider(collider, Some(body))));
         }
         let row = &model.arm.rows()[i];
-        let offset = Isometry3::rotation(Vector3::z() * row.theta_offset_rad);
+        let mut offset = Isometry3::rotation(Vector3::z() * row.theta_offset_rad);
+        if let (0, Some(standing)) = (i, &model.standing) {
+            offset = standing.world_from_rover.inverse() * model.world_from_base * offset;
+        }
         let beyond = Isometry3::translation(row.a_m, 0.0, row.d_m)
             * Isometry3::rotation(Vector3::x() * row.alpha_rad);
         let joint = rp::GenericJointBuilder::new(rp::JointAxesMask::LOCKED_REVOLUTE_AXES)
@@ -207,6 +226,11 @@ impl ArmPhysics {
             multibody.damping_mut()[first + i] = link.damping_nms_rad;
         }
         multibody.damping_mut()[dofs - 1] = model.contact.plunger_damping_ns_m;
+        if let Some(base) = &self.base {
+            for (i, damping) in base.damping.iter().enumerate() {
+                multibody.damping_mut()[first - 3 + i] = *damping;
+            }
+        }
         for (handle, &q) in self.joints.iter().zip(q0_rad) {
             if let Some((multibody, id)) = world.multibody_joints.get_mut(*handle)
                 && let Some(link) = multibody.link_mut(id)
@@ -215,6 +239,9 @@ impl ArmPhysics {
             }
         }
         self.plunger.set_spring(&mut world.multibody_joints);
+        if let Some(base) = &self.base {
+            base.set_springs(&mut world.multibody_joints);
+        }
         if let Some((multibody, _)) = world.multibody_joints.get_mut(self.plunger.joint) {
             multibody.forward_kinematics(&world.bodies, true);
             multibody.update_rigid_bodies(&mut world.bodies, true);
@@ -261,9 +288,21 @@ impl ArmPhysics {
         isometry(self.world.bodies[self.links[link]].position())
     }
 
-    /// Pose of the base, world frame.
+    /// Pose of the base with a rigid mount, world frame.
     pub fn world_from_base(&self) -> Isometry3<f64> {
         self.world_from_base
+    }
+
+    /// Pose of the rover that carries the arm, world frame, if there is one.
+    pub fn world_from_rover(&self) -> Option<Isometry3<f64>> {
+        self.base.as_ref().map(|b| b.world_from_rover(&self.world))
+    }
+
+    /// Rates of the rover's pitch and roll, rad/s, if there is one.
+    pub fn tilt_rates_rad_s(&self) -> Option<[f64; 2]> {
+        self.base
+            .as_ref()
+            .map(|b| b.rates(&self.world.multibody_joints))
     }
 
     /// Pose of the plunger: origin at the ball's centre, z along the approach axis, world frame.

@@ -1,6 +1,10 @@
 //! Checks of a simulation's description: field, what was found, what was expected.
 
-use crate::{SimulationError, arm::CONTACT_FREQUENCY_HZ, description::SimulationDescription};
+use crate::{
+    SimulationError,
+    arm::CONTACT_FREQUENCY_HZ,
+    description::{SimulationDescription, TerrainDescription},
+};
 use rover_robot::Robot;
 use std::ops::RangeInclusive;
 
@@ -77,7 +81,8 @@ pub(crate) fn description(d: &SimulationDescription, robot: &Robot, start_rad: &
         }
     }
     if let Some(v) = &d.faults.rock_vanishes {
-        let rocks = d.terrain.rocks.len() as u32 + d.terrain.scattered.count_n;
+        let field = d.terrain.field.map_or(0, |f| f.count_n);
+        let rocks = d.terrain.rocks.len() as u32 + d.terrain.scattered.count_n + field;
         if v.rock_n >= rocks {
             let expected = format!("below the number of rocks, {rocks}");
             return Err(SimulationError::field(
@@ -106,6 +111,11 @@ fn truth(d: &SimulationDescription) -> Checked {
             "truth.intrinsics.principal_point_px",
             t.intrinsics.principal_point_px,
             0.0..=100.0,
+        ),
+        (
+            "truth.mobility_scale",
+            t.mobility_scale.unwrap_or(1.0),
+            0.0..=20.0,
         ),
     ])
 }
@@ -163,7 +173,49 @@ fn terrain(d: &SimulationDescription) -> Checked {
             f64::from(s.subdivisions_n),
             0.0..=5.0,
         ),
-    ])
+    ])?;
+    field_and_soil(t)
+}
+
+fn field_and_soil(t: &TerrainDescription) -> Checked {
+    if let Some(f) = &t.field {
+        all_within(&[
+            ("terrain.field.count_n", f64::from(f.count_n), 0.0..=500.0),
+            ("terrain.field.radius_m[0]", f.radius_m[0], 1e-2..=3.0),
+            (
+                "terrain.field.radius_m[1]",
+                f.radius_m[1],
+                f.radius_m[0]..=3.0,
+            ),
+            ("terrain.field.buried", f.buried, -1.0..=0.9),
+            ("terrain.field.roughness", f.roughness, 0.0..=0.5),
+            (
+                "terrain.field.subdivisions_n",
+                f64::from(f.subdivisions_n),
+                0.0..=7.0,
+            ),
+            ("terrain.field.clear_m", f.clear_m, 0.0..=100.0),
+            ("terrain.field.gap_m", f.gap_m, 0.0..=100.0),
+        ])?;
+    }
+    let Some(s) = &t.soil else {
+        return Ok(());
+    };
+    all_within(&[
+        (
+            "terrain.soil.resistance_ratio",
+            s.resistance_ratio,
+            0.0..=0.5,
+        ),
+        ("terrain.soil.variation", s.variation, 0.0..=1.0),
+        ("terrain.soil.wavelength_m", s.wavelength_m, 0.05..=100.0),
+    ])?;
+    for (i, patch) in s.soft.iter().enumerate() {
+        let field = |name: &str| format!("terrain.soil.soft[{i}].{name}");
+        within(&field("radius_m"), patch.radius_m, 0.05..=50.0)?;
+        within(&field("factor"), patch.factor, 0.0..=25.0)?;
+    }
+    Ok(())
 }
 
 fn driver_and_contact(d: &SimulationDescription, robot: &Robot) -> Checked {

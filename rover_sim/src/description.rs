@@ -3,6 +3,9 @@
 //! Everything is in the world frame, which for a wall-mounted testbed is the rover frame: x
 //! forward, y left, z up. Every field has a default, so a scenario names only what it changes.
 
+mod mobile;
+
+pub use mobile::{RockField, RoverStart, SoftPatch, SoilDescription};
 use serde::{Deserialize, Serialize};
 
 /// Everything that the simulator needs besides the robot file and a seed.
@@ -28,6 +31,8 @@ pub struct SimulationDescription {
     /// The pixel that the target is designated by; occlusion is measured from the surface seen
     /// there.
     pub target: Option<TargetPixel>,
+    /// Where a robot that drives stands at the start; at the origin if not given.
+    pub rover: Option<RoverStart>,
     /// Faults shown from the start or at a given moment.
     pub faults: FaultsDescription,
 }
@@ -44,6 +49,7 @@ impl Default for SimulationDescription {
             contact: ContactDescription::default(),
             occlusion: None,
             target: None,
+            rover: None,
             faults: FaultsDescription::default(),
         }
     }
@@ -66,6 +72,9 @@ pub struct TruthDescription {
     pub droop: bool,
     /// Camera intrinsics.
     pub intrinsics: IntrinsicsError,
+    /// Errors of mast, odometry and attitude sensor as a multiple of what the robot file states;
+    /// 1 if not given.
+    pub mobility_scale: Option<f64>,
 }
 
 impl Default for TruthDescription {
@@ -77,6 +86,7 @@ impl Default for TruthDescription {
             backlash_rad: 0.0,
             droop: true,
             intrinsics: IntrinsicsError::default(),
+            mobility_scale: None,
         }
     }
 }
@@ -116,6 +126,10 @@ pub struct TerrainDescription {
     pub rocks: Vec<RockDescription>,
     /// Small rocks at random places.
     pub scattered: ScatteredRocks,
+    /// Large rocks at random places; their indices follow the scattered ones'.
+    pub field: Option<RockField>,
+    /// The ground under wheels.
+    pub soil: Option<SoilDescription>,
 }
 
 impl Default for TerrainDescription {
@@ -131,6 +145,8 @@ impl Default for TerrainDescription {
             seed: 1,
             rocks: vec![RockDescription::default()],
             scattered: ScatteredRocks::default(),
+            field: None,
+            soil: None,
         }
     }
 }

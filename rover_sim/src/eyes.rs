@@ -3,6 +3,7 @@
 use crate::{
     SimulationError,
     description::{ImageDescription, SimulationDescription, SunDescription},
+    rover::vehicle_parts,
     terrain::Terrain,
     truth::Truth,
 };
@@ -12,13 +13,14 @@ use rover_messages::{
     Fault,
     imaging::{ImageData, RawPair},
     keys::service::HARDWARE,
+    mobility::{MastState, WheelsState},
     simulation::{View, ViewRequest},
 };
 use rover_render::{
     CameraId, DynamicPart, FrameState, Grey8, ImagingParameters, Mesh, Plate, Renderer, Scene, Sky,
     StaticMesh, Sun, Surface, shapes,
 };
-use rover_robot::{Capsule, FiducialDescription, Robot};
+use rover_robot::{CameraMount, Capsule, FiducialDescription, Robot};
 use std::{
     collections::BTreeMap,
     sync::{
@@ -43,6 +45,30 @@ pub struct Moment {
     pub(crate) frame: FrameState,
     /// Bodies of the terrain that are gone.
     pub(crate) gone: Vec<usize>,
+    /// The rover that carries cameras and arm; `None` if they are fixed to the world.
+    pub(crate) rover: Option<RoverMoment>,
+}
+
+/// A rover at one instant.
+#[derive(Clone, Debug)]
+pub(crate) struct RoverMoment {
+    pub world_from_rover: Isometry3<f64>,
+    /// True pose of the mast's head, world frame.
+    pub world_from_head: Option<Isometry3<f64>>,
+    /// What the rover itself reports.
+    pub mast: Option<MastState>,
+    pub wheels: WheelsState,
+}
+
+impl Moment {
+    /// Pose of what a pair is mounted on, world frame; `None` if it is fixed to the world.
+    fn world_from_mount(&self, mount: CameraMount) -> Option<Isometry3<f64>> {
+        let rover = self.rover.as_ref()?;
+        match mount {
+            CameraMount::Body => Some(rover.world_from_rover),
+            CameraMount::Mast => rover.world_from_head,
+        }
+    }
 }
 
 /// A place on the true terrain.
@@ -52,6 +78,8 @@ pub struct SurfacePoint {
     pub point_m: Vector3<f64>,
     /// Outward normal, averaged over the instrument's footprint, world frame.
     pub normal: Unit<Vector3<f64>>,
+    /// Body of the terrain: 0 for the ground, then the rocks.
+    pub body_n: usize,
 }
 
 /// The true cameras and the scene before them.
@@ -69,6 +97,7 @@ pub struct Eyes {
 
 struct EyePair {
     name: String,
+    mount: CameraMount,
     left: Camera,
     ids: [CameraId; 2],
 }
@@ -82,27 +111,28 @@ impl Eyes {
         seed: u64,
     ) -> Result<Self, SimulationError> {
         let mut statics = terrain.bodies.clone();
-        statics.extend(
-            robot
-                .description()
-                .body
-                .iter()
-                .enumerate()
-                .map(|(i, c)| StaticMesh {
+        let (mut parts, plate) = robot_parts(robot);
+        match &robot.description().mobility {
+            Some(mobility) => parts.extend(vehicle_parts(robot, mobility)),
+            None => {
+                let body = robot.description().body.iter().enumerate();
+                statics.extend(body.map(|(i, c)| StaticMesh {
                     mesh: capsule_mesh(c),
                     surface: Surface::metal(100 + i as u32),
-                }),
-        );
-        let (parts, plate) = robot_parts(robot);
+                }));
+            }
+        }
         let scene = Scene::new(statics, parts, vec![plate], sun(&d.sun), Sky::default())?;
         let mut renderer = Renderer::new(scene);
         let parameters = imaging(&d.image);
         let pairs = truth
             .pairs
             .iter()
-            .map(|pair| {
+            .zip(&robot.description().cameras)
+            .map(|(pair, described)| {
                 Ok(EyePair {
                     name: pair.name.clone(),
+                    mount: described.mount,
                     left: pair.cameras.left.clone(),
                     ids: [
                         renderer.add_camera(&pair.cameras.left, parameters)?,
@@ -140,6 +170,13 @@ impl Eyes {
             .iter()
             .fold(self.seed, |hash, word| mix(hash ^ word));
         let [left, right] = self.pairs[index].ids;
+        if let Some(pose) = moment.world_from_mount(self.pairs[index].mount) {
+            for id in [left, right] {
+                self.renderer
+                    .set_camera_pose(id, &pose)
+                    .map_err(|e| Fault::new(HARDWARE, "rendering_failed", e.to_string()))?;
+            }
+        }
         let (left, right) = self
             .renderer
             .render_pair(left, right, &moment.frame, noise)
@@ -152,6 +189,8 @@ impl Eyes {
             step: moment.step,
             left: image(left),
             right: image(right),
+            mast: moment.rover.as_ref().and_then(|r| r.mast.clone()),
+            wheels: moment.rover.as_ref().map(|r| r.wheels.clone()),
         })
     }
 
@@ -226,6 +265,7 @@ impl Eyes {
     /// [`SimulationError::NoSurface`] when there is no such pair, no ray or no terrain.
     pub fn surface_at(
         &self,
+        moment: &Moment,
         pair: &str,
         pixel_px: [f64; 2],
     ) -> Result<SurfacePoint, SimulationError> {
@@ -235,16 +275,23 @@ impl Eyes {
             u_px,
             v_px,
         };
-        let camera = &self
+        let eye = self
             .pairs
             .iter()
             .find(|p| p.name == pair)
-            .ok_or_else(none)?
-            .left;
-        let ray = camera.ray(&Vector2::new(u_px, v_px)).map_err(|_| none())?;
+            .ok_or_else(none)?;
+        let ray = eye
+            .left
+            .ray(&Vector2::new(u_px, v_px))
+            .map_err(|_| none())?;
+        let (mut origin, mut direction) = (ray.origin, ray.direction.into_inner());
+        if let Some(pose) = moment.world_from_mount(eye.mount) {
+            origin = (pose * Point3::from(origin)).coords;
+            direction = pose.rotation * direction;
+        }
         let hit = self
             .renderer
-            .cast(&ray.origin, &ray.direction.into_inner(), None)
+            .cast(&origin, &direction, None)
             .ok_or_else(none)?;
         // The robot's own body, which comes after the terrain, is no target.
         let mesh = &self
@@ -258,6 +305,48 @@ impl Eyes {
         Ok(SurfacePoint {
             point_m: hit.point,
             normal,
+            body_n: hit.mesh_index,
+        })
+    }
+
+    /// Whether a pair's left camera sees a point of the terrain, and at which pixel: nothing of
+    /// terrain or robot is before it.
+    pub(crate) fn pixel_of(
+        &self,
+        moment: &Moment,
+        pair: &str,
+        point: &Vector3<f64>,
+    ) -> Option<[f64; 2]> {
+        let eye = self.pairs.iter().find(|p| p.name == pair)?;
+        let pose = moment
+            .world_from_mount(eye.mount)
+            .unwrap_or_else(Isometry3::identity);
+        let in_mount = (pose.inverse() * Point3::from(*point)).coords;
+        let pixel = eye.left.project(&in_mount).ok()?;
+        if !eye.left.contains(&pixel, 0.0) {
+            return None;
+        }
+        let centre = (pose * Point3::from(*eye.left.model.cahv()[0])).coords;
+        let along = point - centre;
+        let hit = self
+            .renderer
+            .cast(&centre, &along.normalize(), Some(&moment.frame))?;
+        ((hit.point - point).norm() < 1e-3).then_some(pixel.into())
+    }
+
+    /// The first thing of the terrain on a ray: point, facet normal, and which body.
+    pub(crate) fn first_on(
+        &self,
+        origin: &Vector3<f64>,
+        along: &Vector3<f64>,
+    ) -> Option<SurfacePoint> {
+        let hit = self.renderer.cast(origin, along, None)?;
+        let mesh = &self.terrain.bodies.get(hit.mesh_index)?.mesh;
+        let normal = mean_normal(mesh, &hit.point, self.footprint_m);
+        Some(SurfacePoint {
+            point_m: hit.point,
+            normal: Unit::try_new(normal, 1e-12)?,
+            body_n: hit.mesh_index,
         })
     }
 
@@ -378,7 +467,7 @@ fn plunger_part(robot: &Robot) -> DynamicPart {
     }
 }
 
-fn capsule_mesh(c: &Capsule) -> Mesh {
+pub(crate) fn capsule_mesh(c: &Capsule) -> Mesh {
     let (from, to) = (Vector3::from(c.from_m), Vector3::from(c.to_m));
     let along = to - from;
     let turn = UnitQuaternion::rotation_between(&Vector3::z(), &along)
@@ -398,6 +487,13 @@ fn lies_in_plate(
             && p.y.abs() <= fiducial.layout.half_height_m
             && p.z.abs() < c.radius_m
     })
+}
+
+pub(crate) fn encloses(c: &Capsule, p: &Vector3<f64>) -> bool {
+    let (from, to) = (Vector3::from(c.from_m), Vector3::from(c.to_m));
+    let along = to - from;
+    let s = ((p - from).dot(&along) / along.norm_squared().max(1e-18)).clamp(0.0, 1.0);
+    (from + along * s - p).norm() < c.radius_m
 }
 
 fn sun(d: &SunDescription) -> Sun {

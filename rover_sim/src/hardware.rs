@@ -1,19 +1,25 @@
 //! The simulator on the bus: the keys that a robot's hardware offers, and the simulator's own
 //! under `sim/`.
 //!
-//! Simulated time passes only in the heartbeat periods that the commander of `arm/execute` grants
-//! (and, in real time, by the wall clock). A commander that is lost, late or calls the goal off
+//! Simulated time passes only in the heartbeat periods that the commander of `arm/execute`,
+//! `wheels/drive` or `mast/point` grants (and, in real time, by the wall clock). A commander that is lost, late or calls the goal off
 //! has the arm stopped in the very control step that it last granted, so the stop is the same
 //! every time, whatever the machine's load.
 
+mod lockstep;
+
 use crate::world::{Advance, World, lock};
-use rover_bus::{ActionPolicy, BusError, GoalContext, Interrupt, Peer, Stream};
+use lockstep::{Arm, Mast, Wheels};
+use rover_bus::{BusError, Peer, Stream};
 use rover_messages::{
     Fault, Nothing,
-    arm::{ArmState, ExecuteFeedback, ExecuteGoal, ExecuteResult, StopReason},
+    arm::{ArmState, StopReason},
     imaging::CaptureRequest,
     keys::{self, service::HARDWARE},
-    simulation::{InjectedFault, ScoreRequest, StepRequest, ViewRequest},
+    mobility::{DriveStop, MastState, WheelsState},
+    simulation::{
+        DesignateRequest, InjectedFault, PickRequest, ScoreRequest, StepRequest, ViewRequest,
+    },
 };
 use rover_service::{Service, ServiceShell};
 use std::{
@@ -76,6 +82,8 @@ impl Drop for Hardware {
 struct Hands {
     world: Arc<Mutex<World>>,
     states: Arc<Stream<ArmState>>,
+    masts: Option<Arc<Stream<MastState>>>,
+    wheels: Option<Arc<Stream<WheelsState>>>,
     shell: ServiceShell,
     pace: Option<Pace>,
 }
@@ -101,6 +109,15 @@ pub async fn serve(peer: &Peer, world: World, options: Options) -> Result<Hardwa
     let robot = world.robot().clone();
     let shell = ServiceShell::new(peer, &robot, HARDWARE).await?;
     let states = Arc::new(peer.stream(keys::ARM_STATE).await?);
+    let d = robot.description();
+    let masts = match d.mast {
+        Some(_) => Some(Arc::new(peer.stream(keys::MAST_STATE).await?)),
+        None => None,
+    };
+    let wheels = match d.mobility {
+        Some(_) => Some(Arc::new(peer.stream(keys::WHEELS_STATE).await?)),
+        None => None,
+    };
     let pace = options.realtime.then(|| Pace {
         since: Instant::now(),
         sim_time_s: world.sim_time_s(),
@@ -108,6 +125,8 @@ pub async fn serve(peer: &Peer, world: World, options: Options) -> Result<Hardwa
     let hands = Hands {
         world: Arc::new(Mutex::new(world)),
         states,
+        masts,
+        wheels,
         shell: shell.clone(),
         pace,
     };
@@ -117,14 +136,21 @@ pub async fn serve(peer: &Peer, world: World, options: Options) -> Result<Hardwa
     } else {
         options.beat_limit
     };
-    let policy = ActionPolicy::lockstep(beat_limit);
-    let mut served = vec![
-        peer.serve_action(keys::ARM_EXECUTE, policy, {
-            let hands = hands.clone();
-            move |context, goal| execute(hands.clone(), context, goal)
-        })
-        .await?,
-    ];
+    let mut served = vec![lockstep::serve::<Arm>(peer, &hands, beat_limit).await?];
+    if d.mast.is_some() {
+        served.push(lockstep::serve::<Mast>(peer, &hands, beat_limit).await?);
+    }
+    if d.mobility.is_some() {
+        served.push(lockstep::serve::<Wheels>(peer, &hands, beat_limit).await?);
+        let stop = |hands: &Hands, _: Nothing| {
+            lock(&hands.world).stop_drive(DriveStop::StopCommand);
+            hands.publish();
+            lock(&hands.world)
+                .wheels_state()
+                .ok_or_else(nothing_under_way)
+        };
+        served.push(hands.query(peer, keys::WHEELS_STOP, "stops", stop).await?);
+    }
     served.push(
         hands
             .query(peer, keys::ARM_STOP, "stops", |hands, _: Nothing| {
@@ -163,6 +189,28 @@ async fn simulation_keys(peer: &Peer, hands: &Hands) -> Result<Vec<rover_bus::Se
                 keys::SIM_TRUTH_SCORE,
                 "scores",
                 |hands, request: ScoreRequest| lock(&hands.world).score(&request),
+            )
+            .await?,
+        hands
+            .query(
+                peer,
+                keys::SIM_TRUTH_DESIGNATE,
+                "designations",
+                |hands, request: DesignateRequest| {
+                    let mut world = lock(&hands.world);
+                    let surface = world
+                        .designate(&request.pair, request.pixel_px)
+                        .map_err(|e| Fault::new(HARDWARE, "no_surface", e.to_string()))?;
+                    Ok(world.true_place(&surface))
+                },
+            )
+            .await?,
+        hands
+            .query(
+                peer,
+                keys::SIM_TRUTH_PICK,
+                "picks",
+                |hands, request: PickRequest| lock(&hands.world).pick(&request),
             )
             .await?,
         hands
@@ -248,7 +296,7 @@ impl Hands {
         (world.eyes(), world.moment())
     }
 
-    /// Publishes the arm's state and returns it.
+    /// Publishes the states of arm, mast and wheels and returns the arm's.
     fn publish(&self) -> ArmState {
         // Published under the world's lock: states appear in the order of their steps.
         let world = lock(&self.world);
@@ -256,15 +304,24 @@ impl Hands {
         if let Err(error) = self.states.publish(state.clone()) {
             tracing::warn!(%error, "the arm's state could not be published");
         }
+        if let (Some(stream), Some(mast)) = (&self.masts, world.mast_state())
+            && let Err(error) = stream.publish(mast)
+        {
+            tracing::warn!(%error, "the mast's state could not be published");
+        }
+        if let (Some(stream), Some(wheels)) = (&self.wheels, world.wheels_state())
+            && let Err(error) = stream.publish(wheels)
+        {
+            tracing::warn!(%error, "the wheels' state could not be published");
+        }
         state
     }
 
     /// Grants one heartbeat period to the world and tells what came of it.
-    fn grant(&self) -> (Advance, ExecuteFeedback) {
+    fn grant(&self) -> Advance {
         let mut world = lock(&self.world);
         let before = world.collision();
         let advance = world.advance(1);
-        let elapsed_s = world.elapsed_s();
         let collision = world.collision().filter(|_| before.is_none());
         drop(world);
         if let Some(c) = collision {
@@ -276,13 +333,8 @@ impl Hands {
             self.shell
                 .fault(&fault, "none: the driver does not feel it");
         }
-        (
-            advance,
-            ExecuteFeedback {
-                state: self.publish(),
-                elapsed_s,
-            },
-        )
+        self.publish();
+        advance
     }
 
     /// Lets time pass while no motion is under way.
@@ -295,18 +347,6 @@ impl Hands {
         world.advance(periods);
         drop(world);
         Ok(self.publish())
-    }
-
-    /// Stops the motion and grants time until the arm is at rest.
-    fn run_to_rest(&self, reason: StopReason) -> Result<ExecuteResult, Fault> {
-        lock(&self.world).stop(reason);
-        loop {
-            match self.grant().0 {
-                Advance::Moving => {}
-                Advance::Ended(outcome) => return outcome,
-                Advance::Idle => return Err(nothing_under_way()),
-            }
-        }
     }
 }
 
@@ -321,95 +361,6 @@ async fn computed<T: Send + 'static>(
 
 fn nothing_under_way() -> Fault {
     Fault::new(HARDWARE, "internal_error", "no motion is under way")
-}
-
-/// `arm/execute`: each heartbeat grants one period.
-async fn execute(
-    hands: Hands,
-    context: GoalContext<ExecuteFeedback>,
-    goal: ExecuteGoal,
-) -> Result<ExecuteResult, Fault> {
-    let outcome = executed(&hands, &context, goal).await;
-    match &outcome {
-        Ok(_) => hands.shell.count("motions"),
-        Err(fault) => hands.shell.fault(fault, "arm at rest, goal failed"),
-    }
-    outcome
-}
-
-async fn executed(
-    hands: &Hands,
-    context: &GoalContext<ExecuteFeedback>,
-    goal: ExecuteGoal,
-) -> Result<ExecuteResult, Fault> {
-    let shell = hands.shell.clone();
-    let _activity = shell.activity("moving");
-    let started = hands.clone();
-    computed(move || {
-        if lock(&started.world).is_moving() {
-            // Its handler has gone without an end.
-            let commander = String::from("unknown");
-            let _ = started.run_to_rest(StopReason::CommanderLost { commander });
-        }
-        let begun = lock(&started.world).start(goal.trajectory, goal.guard);
-        started.publish();
-        begun
-    })
-    .await??;
-    loop {
-        let interrupt = context.next_beat().await;
-        let reason = match &interrupt {
-            Interrupt::Beat => {
-                let granted = hands.clone();
-                let (advance, feedback) = computed(move || granted.grant()).await?;
-                if let Some(pace) = hands.pace {
-                    tokio::time::sleep_until(pace.due(feedback.state.sim_time_s)).await;
-                }
-                match advance {
-                    Advance::Moving => context.feedback(feedback),
-                    Advance::Ended(outcome) => return outcome,
-                    Advance::Idle => return Err(nothing_under_way()),
-                }
-                continue;
-            }
-            Interrupt::Cancelled => StopReason::Cancelled,
-            Interrupt::CommanderLost { .. } | Interrupt::Overdue { .. } => {
-                StopReason::CommanderLost {
-                    commander: context.commander().to_owned(),
-                }
-            }
-        };
-        return interrupted(hands, &interrupt, reason).await;
-    }
-}
-
-/// Brings the arm to rest after an interruption. The goal fails, unless the motion has ended by
-/// itself in the meantime.
-async fn interrupted(
-    hands: &Hands,
-    interrupt: &Interrupt,
-    reason: StopReason,
-) -> Result<ExecuteResult, Fault> {
-    let stopped = hands.clone();
-    let (outcome, granted_s, rest_s) = computed(move || {
-        // Time has stood still since the end of the last granted period.
-        let granted_s = lock(&stopped.world).sim_time_s();
-        let outcome = stopped.run_to_rest(reason);
-        let rest_s = lock(&stopped.world).sim_time_s();
-        (outcome, granted_s, rest_s)
-    })
-    .await?;
-    let mut fault = match outcome {
-        Err(fault) => fault,
-        // The switch closed or a limit was met in the last period; the goal is void all the same.
-        Ok(_) => interrupt
-            .to_fault(HARDWARE)
-            .unwrap_or_else(nothing_under_way),
-    };
-    if let Interrupt::Overdue { waited_ms } = interrupt {
-        fault = fault.with("waited_ms", *waited_ms as f64);
-    }
-    Err(fault.with("since_last_beat_ms", (rest_s - granted_s) * 1e3))
 }
 
 /// In real time: lets time pass while no motion is under way.

@@ -13,6 +13,8 @@
 //! | `arm`, `contact_switch`, `statics` | the multibody, the plunger, droop at rest |
 //! | `driver` | trajectories, stops, limits of the motors |
 //! | `eyes` | what true cameras see |
+//! | `rover` | wheels, slip, odometry, mast: the driving rover |
+//! | `standing` | the rover on its springs while the arm works |
 //! | `world`, `score` | all of it together, and a placement against the truth |
 //! | `hardware` | the keys on the bus |
 
@@ -25,7 +27,9 @@ mod driver;
 mod error;
 mod eyes;
 pub mod hardware;
+mod rover;
 mod score;
+mod standing;
 mod statics;
 mod terrain;
 #[cfg(test)]
@@ -36,13 +40,14 @@ mod world;
 pub use arm::{ArmModel, ArmPhysics, Contacts, StaticSurface, TipContact};
 pub use description::{
     ContactDescription, DriverDescription, FaultsDescription, ImageDescription, IntrinsicsError,
-    Moment as FaultMoment, OcclusionDescription, RockDescription, ScatteredRocks,
-    SimulationDescription, SunDescription, TargetPixel, TerrainDescription, TruthDescription,
-    VanishingRock,
+    Moment as FaultMoment, OcclusionDescription, RockDescription, RockField, RoverStart,
+    ScatteredRocks, SimulationDescription, SoftPatch, SoilDescription, SunDescription, TargetPixel,
+    TerrainDescription, TruthDescription, VanishingRock,
 };
 pub use error::SimulationError;
 pub use eyes::{Eyes, Moment, SurfacePoint};
 pub use hardware::Hardware;
+pub use standing::Standing;
 pub use statics::{drooped_angles_rad, gravity_torques_nm};
 pub use terrain::Terrain;
 pub use truth::{TruePair, Truth};

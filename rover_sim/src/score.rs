@@ -17,14 +17,22 @@ impl World {
     pub fn score(&mut self, request: &ScoreRequest) -> Result<Score, Fault> {
         let target = &request.target;
         let fault = |name, message: String| Fault::new(HARDWARE, name, message);
-        let true_pair = self
-            .truth
-            .pair(&target.pair)
-            .ok_or_else(|| fault("unknown_pair", format!("no camera pair `{}`", target.pair)))?;
-        let believed_from_true = true_pair.believed_from_true;
-        let surface = self
-            .designate(&target.pair, target.pixel_px)
+        let designation = self
+            .designation(&target.pair, target.pixel_px)
             .map_err(|e| fault("no_surface", e.to_string()))?;
+        // The rover frame in which the target is believed: that of the moment it was measured.
+        let (believed, world_from_rover) = match &request.handed_over {
+            Some(placed) => (placed, self.world_from_rover()),
+            None => (target, Some(designation.world_from_rover)),
+        };
+        let true_pair = self.truth.pair(&believed.pair).ok_or_else(|| {
+            fault(
+                "unknown_pair",
+                format!("no camera pair `{}`", believed.pair),
+            )
+        })?;
+        let believed_from_true = true_pair.believed_from_true;
+        let surface = designation.surface;
         let (at, normal) = (surface.point_m, surface.normal);
         let contact = self.contact;
         let apart = contact.map(|c| c.point_m - at);
@@ -35,14 +43,25 @@ impl World {
             .transpose()
             .map_err(|message| fault("bad_joints", message))?
             .flatten();
-        let believed_target = believed_from_true.inverse() * Point3::from(target.position_m.coords);
+        // A robot that does not drive has its rover frame in the world's.
+        let drives = self.world_from_rover();
+        let world_from_rover = drives.and(world_from_rover);
+        let mut believed_target =
+            believed_from_true.inverse() * Point3::from(believed.position_m.coords);
+        if let Some(pose) = world_from_rover {
+            believed_target = pose * believed_target;
+        }
         let encoders = self.state().joints_rad;
         let believed_tip = self
             .robot
             .rover_from_link(&encoders)
             .map(|pose| pose.isometry * Point3::from(self.robot.tool.tip_in_link))
             .map_err(|e| fault("bad_joints", e.to_string()))?;
-        let seen_tip = believed_from_true * Point3::from(self.tip_in_world());
+        let mut tip = Point3::from(self.tip_in_world());
+        if let Some(pose) = drives {
+            tip = pose.inverse() * tip;
+        }
+        let seen_tip = believed_from_true * tip;
         Ok(Score {
             target_in_world_m: at.into(),
             normal_in_world: normal.into_inner().into(),
@@ -70,7 +89,13 @@ impl World {
             .arm
             .forward(&drooped)
             .map_err(|e| e.to_string())?;
-        let world_from_link = self.model.world_from_base * base_from_link;
+        let mut world_from_link = self.model.world_from_base * base_from_link;
+        if let Some(standing) = &self.model.standing {
+            let tilted = standing
+                .tilted(&self.model, &drooped)
+                .map_err(|e| e.to_string())?;
+            world_from_link = tilted * standing.world_from_rover.inverse() * world_from_link;
+        }
         let tip = (world_from_link * Point3::from(self.model.tip_in_link)).coords;
         let axis = world_from_link.rotation * self.model.axis_in_link.into_inner();
         let closing = axis.dot(normal);

@@ -19,6 +19,8 @@ pub struct Terrain {
     pub bodies: Vec<StaticMesh>,
     /// How many of the bodies are rocks.
     pub rocks_n: usize,
+    /// Lines of the ground's grid along x and y, m; its vertices run along x first.
+    pub grid_m: [Vec<f64>; 2],
 }
 
 impl Terrain {
@@ -50,17 +52,75 @@ impl Terrain {
                 .map(|k| low + step * k as f64)
                 .collect::<Vec<_>>()
         };
+        let grid_m = [axis(0), axis(1)];
         let ground = StaticMesh {
-            mesh: shapes::heightfield_mesh(&axis(0), &axis(1), height),
+            mesh: shapes::heightfield_mesh(&grid_m[0], &grid_m[1], height),
             surface: Surface::ground(texture_seed(d.seed)),
         };
         let mut bodies = vec![ground];
         bodies.extend(d.rocks.iter().map(rock));
         bodies.extend(scattered(d).iter().map(rock));
+        bodies.extend(rock_field(d).iter().map(rock));
         Self {
             rocks_n: bodies.len() - 1,
             bodies,
+            grid_m,
         }
+    }
+
+    /// Height of the ground's grid line crossing nearest to a place, m.
+    pub(crate) fn height_near_m(&self, x: f64, y: f64) -> f64 {
+        let nearest = |lines: &[f64], at: f64| {
+            let step = (lines[lines.len() - 1] - lines[0]) / (lines.len() - 1) as f64;
+            (((at - lines[0]) / step).round().max(0.0) as usize).min(lines.len() - 1)
+        };
+        let [xs, ys] = &self.grid_m;
+        let (i, j) = (nearest(xs, x), nearest(ys, y));
+        self.bodies[0].mesh.positions[j * xs.len() + i].z
+    }
+
+    /// Largest extent of a body along an axis, m.
+    pub(crate) fn size_m(&self, body: usize) -> f64 {
+        let positions = &self.bodies[body].mesh.positions;
+        let Some(first) = positions.first() else {
+            return 0.0;
+        };
+        let (low, high) = positions
+            .iter()
+            .fold((*first, *first), |(l, h), p| (l.inf(p), h.sup(p)));
+        (high - low).max()
+    }
+
+    /// The part of a body within a square of half width `half_m` about a place, as vertices and
+    /// triangles; empty if there is none.
+    pub(crate) fn part(
+        &self,
+        body: usize,
+        centre: [f64; 2],
+        half_m: f64,
+    ) -> (Vec<Vector3<f64>>, Vec<[u32; 3]>) {
+        let mesh = &self.bodies[body].mesh;
+        let near = |i: u32| {
+            let p = &mesh.positions[i as usize];
+            (p.x - centre[0]).abs() <= half_m && (p.y - centre[1]).abs() <= half_m
+        };
+        let mut place = vec![u32::MAX; mesh.positions.len()];
+        let (mut positions, mut triangles) = (Vec::new(), Vec::new());
+        // Of a rock all triangles are kept if one is near.
+        let whole = body > 0 && mesh.triangles.iter().any(|t| t.iter().any(|&i| near(i)));
+        for t in &mesh.triangles {
+            if whole || t.iter().all(|&i| near(i)) {
+                triangles.push(t.map(|i| {
+                    let at = &mut place[i as usize];
+                    if *at == u32::MAX {
+                        *at = positions.len() as u32;
+                        positions.push(mesh.positions[i as usize]);
+                    }
+                    *at
+                }));
+            }
+        }
+        (positions, triangles)
     }
 }
 
@@ -116,4 +176,44 @@ fn scattered(d: &TerrainDescription) -> Vec<RockDescription> {
             }
         })
         .collect()
+}
+
+/// Large rocks that keep their distance from the start and from each other. A rock that finds no
+/// place in many tries is left out.
+fn rock_field(d: &TerrainDescription) -> Vec<RockDescription> {
+    const TRIES: u32 = 300;
+    let Some(f) = &d.field else {
+        return Vec::new();
+    };
+    let mut random = ChaCha8Rng::seed_from_u64(d.seed);
+    random.set_stream(1);
+    let mut placed: Vec<RockDescription> = Vec::new();
+    for i in 0..f.count_n {
+        let radius_m = f.radius_m[0] + random.random::<f64>() * (f.radius_m[1] - f.radius_m[0]);
+        for _ in 0..TRIES {
+            let [u, v]: [f64; 2] = std::array::from_fn(|_| random.random::<f64>() - 0.5);
+            let x = d.centre_m[0] + u * (d.size_m[0] - 2.0 * radius_m);
+            let y = d.centre_m[1] + v * (d.size_m[1] - 2.0 * radius_m);
+            let clear = x.hypot(y) > f.clear_m + radius_m
+                && placed.iter().chain(&d.rocks).all(|r| {
+                    let apart = (x - r.position_m[0]).hypot(y - r.position_m[1]);
+                    apart > radius_m + r.radius_m + f.gap_m
+                });
+            if !clear {
+                continue;
+            }
+            placed.push(RockDescription {
+                position_m: [x, y, ground_height_m(d, x, y) - f.buried * radius_m],
+                radius_m,
+                roughness: f.roughness,
+                subdivisions_n: f.subdivisions_n,
+                seed: d
+                    .seed
+                    .wrapping_mul(0x9e37_79b9_7f4a_7c15)
+                    .wrapping_add(0x1_0000 + u64::from(i)),
+            });
+            break;
+        }
+    }
+    placed
 }

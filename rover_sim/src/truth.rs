@@ -31,7 +31,8 @@ enum Kind {
 pub struct TruePair {
     /// Name of the pair.
     pub name: String,
-    /// True camera models, world frame.
+    /// True camera models, in the frame of what the pair is mounted on: the rover frame (which
+    /// for a robot that does not drive is the world frame) or the mast's head.
     pub cameras: StereoPair,
     /// Takes a true position to the one that the believed camera models make of it:
     /// `exp(w) (p - c0) + c0 + t` with `c0` the mean of the believed camera centres.
@@ -43,8 +44,8 @@ pub struct TruePair {
 pub struct Truth {
     /// True kinematics.
     pub arm: Arm,
-    /// Pose of the arm's base, world frame.
-    pub world_from_base: Isometry3<f64>,
+    /// Pose of the arm's base, rover frame.
+    pub rover_from_base: Isometry3<f64>,
     /// Camera pairs in the order of the robot file.
     pub pairs: Vec<TruePair>,
     /// Noise of one encoder reading, rad.
@@ -99,8 +100,10 @@ impl Truth {
             .iter()
             .map(|pair| {
                 let [wx, wy, wz, tx, ty, tz] = normals(&mut mounts);
-                let rotation = Vector3::new(wx, wy, wz) * angle_rad;
-                let translation = Vector3::new(tx, ty, tz) * length_m;
+                // The mast has errors of its own.
+                let on_body = f64::from(u8::from(pair.mount.is_body()));
+                let rotation = Vector3::new(wx, wy, wz) * (angle_rad * on_body);
+                let translation = Vector3::new(tx, ty, tz) * (length_m * on_body);
                 let believed = &pair.cameras;
                 let [left, right] = [&believed.left, &believed.right].map(|c| *c.model.cahv()[0]);
                 let centre = (left + right) / 2.0;
@@ -128,7 +131,7 @@ impl Truth {
             .collect::<Result<_, SimulationError>>()?;
         Ok(Self {
             arm: robot.arm.perturbed(&rows)?,
-            world_from_base: robot.rover_from_arm_base.isometry,
+            rover_from_base: robot.rover_from_arm_base.isometry,
             pairs,
             encoder_noise_rad: errors.encoder_noise_rad,
             backlash_rad: errors.backlash_rad,

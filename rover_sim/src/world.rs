@@ -3,27 +3,33 @@
 //! A plain value: no network, no threads, no clock but the steps that it is told to make. Two
 //! worlds built from the same description and seed and told the same give the same bits.
 
+mod build;
+mod mobility;
 mod motion;
 mod observation;
+mod targets;
 
 use crate::{
     SimulationError,
-    arm::{ArmModel, ArmPhysics, StaticSurface, TipContact},
+    arm::{ArmModel, ArmPhysics, TipContact},
     check,
     contact_switch::Switch,
     description::{Moment as FaultMoment, SimulationDescription},
     driver::{Driver, Phase},
-    eyes::{Eyes, SurfacePoint},
+    eyes::Eyes,
+    rover::{Mast, Vehicle},
     statics,
     terrain::Terrain,
     truth::Truth,
 };
+pub(crate) use mobility::levelled;
 use motion::Record;
-use nalgebra::{Unit, Vector3};
+use nalgebra::{Isometry3, Unit, Vector3};
 use rover_messages::{
     Fault,
     arm::{ExecuteResult, StopReason},
     keys::service::HARDWARE,
+    mobility::{DriveResult, PointResult},
 };
 use rover_robot::Robot;
 use std::{
@@ -45,6 +51,10 @@ pub enum Advance {
     Moving,
     /// The motion has ended and the arm is at rest.
     Ended(Result<ExecuteResult, Fault>),
+    /// The drive has ended and the rover stands.
+    Parked(Result<DriveResult, Fault>),
+    /// The mast's movement has ended.
+    Pointed(Result<PointResult, Fault>),
 }
 
 /// The first touch of the instrument on the terrain.
@@ -89,7 +99,13 @@ pub struct World {
     gone: Vec<usize>,
     fiducial_hidden: bool,
     has_moved: bool,
-    designated: Option<((String, [u64; 2]), SurfacePoint)>,
+    designated: Vec<targets::Designation>,
+    mast: Option<Mast>,
+    /// Why the mast was told to stop.
+    mast_stop: Option<StopReason>,
+    vehicle: Option<Vehicle>,
+    /// Poses of the arm's parts in the rover frame while the rover drives.
+    carried: Option<Vec<Isometry3<f64>>>,
     physics_wall_s: f64,
     rendering_wall: Arc<AtomicU64>,
     /// What the world was built from.
@@ -109,20 +125,20 @@ impl World {
     ) -> Result<Self, SimulationError> {
         check::description(description, &robot, start_rad)?;
         let truth = Truth::draw(&robot, &description.truth, seed)?;
-        let model = arm_model(&robot, &truth, description)?;
+        let mut model = build::arm_model(&robot, &truth, description)?;
         let terrain = Arc::new(Terrain::new(&description.terrain));
-        let surfaces: Vec<StaticSurface<'_>> = terrain
-            .bodies
-            .iter()
-            .enumerate()
-            .map(|(i, body)| StaticSurface {
-                name: Terrain::name(i),
-                positions: &body.mesh.positions,
-                triangles: &body.mesh.triangles,
-            })
-            .collect();
+        let vehicle = build::vehicle(&robot, &model, &terrain, description, seed, start_rad)?;
+        if let Some(vehicle) = &vehicle {
+            let pose = vehicle.world_from_rover();
+            build::stand(&mut model, &robot, &truth, &pose, start_rad)?;
+        }
+        let scale = description.truth.mobility_scale.unwrap_or(1.0);
+        let mast = robot
+            .description()
+            .mast
+            .map(|mast| Mast::new(mast, scale, seed, description.step_s));
         let drooped = statics::drooped_angles_rad(&model, start_rad)?;
-        let mut arm = ArmPhysics::new(&model, &surfaces, &drooped)?;
+        let mut arm = build::arm_physics(&model, &terrain, &[], &drooped)?;
         arm.set_rest(start_rad);
         let driver = Driver::new(
             model.arm.limits(),
@@ -162,14 +178,18 @@ impl World {
             gone: Vec::new(),
             fiducial_hidden: description.faults.fiducial_hidden,
             has_moved: false,
-            designated: None,
+            designated: Vec::new(),
+            mast,
+            mast_stop: None,
+            vehicle,
+            carried: None,
             physics_wall_s: 0.0,
             rendering_wall,
             origin: (seed, start_rad.to_vec()),
         };
         world.come_to_rest();
         if let Some(target) = &description.target {
-            let found = world.designate(&target.pair, target.pixel_px);
+            let found = world.designate(&target.pair, target.pixel_px).map(|_| ());
             // Only occlusion needs the point from the start; a pixel in the sky is for target
             // selection to refuse.
             if description.occlusion.is_some() {
@@ -233,30 +253,14 @@ impl World {
         self.step
     }
 
-    /// Whether a motion is under way.
-    pub fn is_moving(&self) -> bool {
+    /// Whether a motion of the arm is under way.
+    pub fn is_arm_moving(&self) -> bool {
         self.driver.phase != Phase::Idle
     }
 
-    /// Names the pixel of the target: its true surface point is found now, before anything moves
-    /// or vanishes, and is what occlusion and scores refer to.
-    ///
-    /// # Errors
-    /// [`SimulationError::NoSurface`].
-    pub fn designate(
-        &mut self,
-        pair: &str,
-        pixel_px: [f64; 2],
-    ) -> Result<SurfacePoint, SimulationError> {
-        let key = (pair.to_owned(), pixel_px.map(f64::to_bits));
-        if let Some((known, point)) = &self.designated
-            && *known == key
-        {
-            return Ok(*point);
-        }
-        let point = lock(&self.eyes).surface_at(pair, pixel_px)?;
-        self.designated = Some((key, point));
-        Ok(point)
+    /// Whether arm, wheels or mast are moving.
+    pub fn is_moving(&self) -> bool {
+        self.is_arm_moving() || self.is_driving() || self.is_pointing()
     }
 
     /// Grants heartbeat periods; ends early, in the very step, when a motion ends.
@@ -269,11 +273,18 @@ impl World {
             Advance::Idle
         };
         for _ in 0..steps {
-            self.physics_step();
-            if outcome == Advance::Moving
-                && let Some(ended) = self.supervise()
-            {
-                outcome = Advance::Ended(ended);
+            let ended = if self.is_driving() {
+                self.drive_step().map(Advance::Parked)
+            } else {
+                self.physics_step();
+                if self.is_arm_moving() {
+                    self.supervise().map(Advance::Ended)
+                } else {
+                    self.mast_step().map(Advance::Pointed)
+                }
+            };
+            if let Some(ended) = ended {
+                outcome = ended;
                 break;
             }
         }
@@ -356,7 +367,12 @@ impl World {
     }
 
     fn remove_body(&mut self, body: usize) {
-        if self.arm.remove_surface(body) {
+        let is_new = !self.gone.contains(&body);
+        self.arm.remove_surface(body);
+        if let Some(vehicle) = &mut self.vehicle {
+            vehicle.remove_surface(body);
+        }
+        if is_new {
             self.gone.push(body);
         }
     }
@@ -365,32 +381,4 @@ impl World {
 /// The lock even if a thread panicked while it held it: every picture is made anew.
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// The true arm for rapier.
-fn arm_model(
-    robot: &Robot,
-    truth: &Truth,
-    description: &SimulationDescription,
-) -> Result<ArmModel, SimulationError> {
-    let d = robot.description();
-    let dynamics = d.dynamics.as_ref().ok_or_else(|| SimulationError::Robot {
-        robot: d.name.clone(),
-        field: "dynamics".into(),
-        message: "missing; a simulator needs masses and stiffnesses".into(),
-    })?;
-    let droop = if description.truth.droop { 1.0 } else { 0.0 };
-    Ok(ArmModel {
-        arm: truth.arm.clone(),
-        world_from_base: truth.world_from_base,
-        links: dynamics.links.clone(),
-        shapes: d.arm.joints.iter().map(|j| j.shape.clone()).collect(),
-        body: d.body.clone(),
-        tip_in_link: robot.tool.tip_in_link,
-        axis_in_link: robot.tool.axis_in_link,
-        switch: d.tool.switch,
-        contact: description.contact,
-        gravity_m_s2: Vector3::from(dynamics.gravity_m_s2) * droop,
-        step_s: description.step_s,
-    })
 }

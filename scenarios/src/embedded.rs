@@ -29,10 +29,16 @@ pub const SCENARIOS: &[ShippedFile] = &[
 ];
 
 /// Shipped robots.
-pub const ROBOTS: &[ShippedFile] = &[(
-    "scenarios/robots/bluestreak.toml",
-    include_str!("../robots/bluestreak.toml"),
-)];
+pub const ROBOTS: &[ShippedFile] = &[
+    (
+        "scenarios/robots/bluestreak.toml",
+        include_str!("../robots/bluestreak.toml"),
+    ),
+    (
+        "scenarios/robots/rocky8.toml",
+        include_str!("../robots/rocky8.toml"),
+    ),
+];
 
 /// Name of the scenario that runs when none is named.
 pub const DEFAULT_SCENARIO: &str = "scenarios/bluestreak.toml";

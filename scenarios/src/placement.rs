@@ -270,6 +270,7 @@ impl<'a> Mission<'a> {
             let open_loop_joints_rad = open_loop_joints(self.robot, target, &state.joints_rad);
             let request = ScoreRequest {
                 target: target.clone(),
+                handed_over: None,
                 open_loop_joints_rad,
             };
             self.peer

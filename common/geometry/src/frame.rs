@@ -26,6 +26,11 @@ frames! {
     ArmBase = "arm_base";
     /// The arm's last link frame, to which the instrument and the fiducial are fixed.
     Link = "link";
+    /// The mast's head: x along the view, y left, z up with pan and tilt at zero; turns with both.
+    MastHead = "mast_head";
+    /// Where a mobile robot stood when it was started: origin at its rover frame's, x along its
+    /// heading then, z up against gravity. What odometry reports is in it.
+    Site = "site";
     /// The simulator's inertial frame; no service knows it.
     World = "world";
 }

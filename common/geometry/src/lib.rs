@@ -12,5 +12,5 @@
 mod frame;
 mod plane;
 
-pub use frame::{ArmBase, Direction, Frame, Link, Point, Rover, Transform, World};
+pub use frame::{ArmBase, Direction, Frame, Link, MastHead, Point, Rover, Site, Transform, World};
 pub use plane::{Plane, PlaneError, tangent_basis};

@@ -1,7 +1,13 @@
 //! Images and stereo frames.
 
-use crate::{codec::bytes_or_base64, wire, wire::Wire};
+use crate::{
+    codec::bytes_or_base64,
+    mobility::{MastState, WheelsState},
+    wire,
+    wire::Wire,
+};
 use rover_cameras::StereoPair;
+use rover_geometry::{Rover, Site, Transform};
 use serde::{Deserialize, Serialize};
 
 /// An 8-bit grey image; pixels row by row from the top left, base64 in JSON.
@@ -56,6 +62,25 @@ pub struct RawPair {
     pub left: ImageData,
     /// Right image.
     pub right: ImageData,
+    /// The mast at the exposure, if the robot has one.
+    #[serde(default)]
+    pub mast: Option<MastState>,
+    /// Odometry and attitude at the exposure, if the robot has wheels.
+    #[serde(default)]
+    pub wheels: Option<WheelsState>,
+}
+
+/// Names one stereo frame: the question to `imaging/<pair>/recall`, which the imaging service
+/// answers for the last frames of each pair.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FrameReference {
+    /// Name of the camera pair.
+    pub pair: String,
+    /// Control step of the exposure.
+    pub step: u64,
+    /// Which of several exposures of that instant.
+    pub exposure_n: u32,
 }
 
 /// One stereo frame with the camera models that belong to it.
@@ -64,22 +89,45 @@ pub struct RawPair {
 pub struct StereoFrame {
     /// The images.
     pub images: RawPair,
-    /// Believed camera models, rover frame.
+    /// Believed camera models at the exposure (a mast pair's placed by the mast's angles), rover
+    /// frame.
     pub cameras: StereoPair,
 }
 
-wire! { CaptureRequest = "capture_request/1" }
+impl StereoFrame {
+    /// Believed pose of the rover at the exposure, by odometry and attitude sensor: takes what
+    /// this frame's models yield (rover frame) to the site frame, where frames of different stops
+    /// meet. `None` for a robot that does not drive.
+    pub fn site_from_rover(&self) -> Option<Transform<Site, Rover>> {
+        self.images
+            .wheels
+            .as_ref()
+            .map(|w| w.pose.site_from_rover())
+    }
+}
+
+wire! {
+    CaptureRequest = "capture_request/1",
+    FrameReference = "frame_reference/1",
+}
 
 impl Wire for RawPair {
-    const SCHEMA: &'static str = "raw_pair/1";
+    const SCHEMA: &'static str = "raw_pair/2";
     fn validate(&self) -> Result<(), String> {
         self.left.check("left")?;
-        self.right.check("right")
+        self.right.check("right")?;
+        if let Some(mast) = &self.mast {
+            mast.validate().map_err(|e| format!("mast.{e}"))?;
+        }
+        if let Some(wheels) = &self.wheels {
+            wheels.validate().map_err(|e| format!("wheels.{e}"))?;
+        }
+        Ok(())
     }
 }
 
 impl Wire for StereoFrame {
-    const SCHEMA: &'static str = "stereo_frame/1";
+    const SCHEMA: &'static str = "stereo_frame/2";
     fn validate(&self) -> Result<(), String> {
         self.images.validate()
     }

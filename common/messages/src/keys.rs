@@ -6,6 +6,19 @@ pub const ARM_STATE: &str = "arm/state";
 pub const ARM_EXECUTE: &str = "arm/execute";
 /// Stops the arm now, query.
 pub const ARM_STOP: &str = "arm/stop";
+/// Mast angles, stream of [`crate::mobility::MastState`].
+pub const MAST_STATE: &str = "mast/state";
+/// Points the mast, lockstep action ([`crate::mobility::PointGoal`]).
+pub const MAST_POINT: &str = "mast/point";
+/// Odometry and attitude, stream of [`crate::mobility::WheelsState`].
+pub const WHEELS_STATE: &str = "wheels/state";
+/// Drives one arc or turns in place, lockstep action ([`crate::mobility::DriveGoal`]).
+pub const WHEELS_DRIVE: &str = "wheels/drive";
+/// Stops the wheels now, query.
+pub const WHEELS_STOP: &str = "wheels/stop";
+/// Drives until a target lies in the arm's workspace, action
+/// ([`crate::approach::DriveToGoal`]).
+pub const APPROACH_DRIVE_TO: &str = "approach/drive_to";
 /// Target selection, query.
 pub const TARGET_SELECT: &str = "target/select";
 /// The target being worked on, stream.
@@ -20,6 +33,10 @@ pub const SERVO_PLACE: &str = "servo/place";
 pub const CONTACT_APPROACH: &str = "contact/approach";
 /// Scores a placement against the truth; simulator only, query.
 pub const SIM_TRUTH_SCORE: &str = "sim/truth/score";
+/// Remembers the true surface point of a pixel; simulator only, query.
+pub const SIM_TRUTH_DESIGNATE: &str = "sim/truth/designate";
+/// A place that a person might choose as a target; simulator only, query.
+pub const SIM_TRUTH_PICK: &str = "sim/truth/pick";
 /// What the simulator knows about the truth of this run; simulator only, query.
 pub const SIM_TRUTH_STATE: &str = "sim/truth/state";
 /// A view of the scene from an outside camera; simulator only, query.
@@ -38,6 +55,10 @@ pub fn camera_grab(pair: &str) -> String {
 /// Stereo frame with camera models, query.
 pub fn imaging_capture(pair: &str) -> String {
     format!("imaging/{pair}/capture")
+}
+/// One of the last stereo frames again, query ([`crate::imaging::FrameReference`]).
+pub fn imaging_recall(pair: &str) -> String {
+    format!("imaging/{pair}/recall")
 }
 /// Last left or right image of `pair` as a picture, stream.
 pub fn imaging_picture(pair: &str, side: &str) -> String {
@@ -64,13 +85,16 @@ pub mod service {
     pub const MAST_IMAGING: &str = "mast_imaging";
     /// Pixel to target.
     pub const TARGET_SELECTION: &str = "target_selection";
+    /// Drives to a target and tracks it; only for a robot with mast and wheels.
+    pub const ROVER_APPROACH: &str = "rover_approach";
     /// Arm trajectories.
     pub const ARM_PLANNER: &str = "arm_planner";
     /// Error compensation.
     pub const EPEC_SERVO: &str = "epec_servo";
     /// Guarded contact motion.
     pub const CONTACT_APPROACH: &str = "contact_approach";
-    /// All services that a placement needs, in starting order; the hardware is not among them.
+    /// All services that a placement with any robot needs, in starting order; the hardware is
+    /// not among them, nor is [`ROVER_APPROACH`].
     pub const ALL: [&str; 5] = [
         MAST_IMAGING,
         TARGET_SELECTION,

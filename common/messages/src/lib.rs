@@ -6,10 +6,12 @@
 //! namespace. Positions are metres in the rover frame unless the field says otherwise, angles
 //! radians, times simulated seconds.
 
+pub mod approach;
 pub mod arm;
 pub mod codec;
 pub mod imaging;
 pub mod keys;
+pub mod mobility;
 pub mod placement;
 pub mod planning;
 pub mod simulation;

@@ -14,6 +14,9 @@ use serde::{Deserialize, Serialize};
 pub struct ScoreRequest {
     /// The target as it was selected.
     pub target: Target,
+    /// The target as it was handed over to the pair that the arm works with, if it was.
+    #[serde(default)]
+    pub handed_over: Option<Target>,
     /// Encoder angles of the purely kinematic placement on the believed target, rad.
     pub open_loop_joints_rad: Option<Vec<f64>>,
 }
@@ -86,6 +89,87 @@ pub struct TruthState {
     /// First uncontrolled contact: simulated time, s, and the link (from 0) that touched
     /// something solid.
     pub collision: Option<(f64, u32)>,
+    /// The rover, if it drives.
+    #[serde(default)]
+    pub rover: Option<TrueRover>,
+}
+
+/// Where a rover really is.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrueRover {
+    /// Origin of the rover frame, world frame, m.
+    pub position_m: [f64; 3],
+    /// Roll, pitch and yaw of the rover frame (fixed axes), world frame, rad.
+    pub rpy_rad: [f64; 3],
+    /// Angle between the present attitude and that in which the wheels left the body, deg: what
+    /// the arm's weight does.
+    pub tilt_by_arm_deg: f64,
+    /// Distance between true and believed position in the site frame, m.
+    pub position_error_m: f64,
+    /// Believed minus true heading, rad.
+    pub heading_error_rad: f64,
+}
+
+/// What a target lies on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SurfaceKind {
+    /// A rock.
+    Rock,
+    /// The ground.
+    Ground,
+}
+
+/// Question to `sim/truth/designate`: remembers, for scores, what the pixel shows now.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DesignateRequest {
+    /// Camera pair whose left image the pixel belongs to.
+    pub pair: String,
+    /// Column and row, px.
+    pub pixel_px: [f64; 2],
+}
+
+/// A true place on the terrain.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TruePlace {
+    /// The point, world frame, m.
+    pub point_in_world_m: [f64; 3],
+    /// Outward normal over the instrument's footprint, world frame.
+    pub normal_in_world: [f64; 3],
+    /// Index of the rock, or none for the ground.
+    pub rock_n: Option<u32>,
+    /// Distance from the rover frame's origin along the ground, m.
+    pub range_m: f64,
+}
+
+/// Question to `sim/truth/pick`: a place that a person might choose.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PickRequest {
+    /// Camera pair in which it shall be named.
+    pub pair: String,
+    /// What it shall lie on.
+    pub surface: SurfaceKind,
+    /// Nearest and farthest distance from the rover frame's origin along the ground, m.
+    pub range_m: [f64; 2],
+    /// Which of many such places.
+    pub choice_n: u32,
+}
+
+/// Answer of `sim/truth/pick`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Pick {
+    /// The place.
+    pub place: TruePlace,
+    /// Pan and tilt that bring it to the middle of the mast's view as a person would, rad, if the
+    /// robot has a mast.
+    pub mast_rad: Option<[f64; 2]>,
+    /// Where the pair's left camera sees it now, px, if it does.
+    pub pixel_px: Option<[f64; 2]>,
 }
 
 /// Question to `sim/step`.
@@ -115,12 +199,23 @@ pub enum InjectedFault {
 }
 
 wire! {
-    ScoreRequest = "score_request/1",
+    ScoreRequest = "score_request/2",
     Score = "score/1",
     ViewRequest = "view_request/1",
     View = "view/1",
-    TruthState = "truth_state/1",
+    TruthState = "truth_state/2",
+    DesignateRequest = "designate_request/1",
+    TruePlace = "true_place/1",
+    Pick = "pick/1",
     InjectedFault = "injected_fault/1",
+}
+
+impl Wire for PickRequest {
+    const SCHEMA: &'static str = "pick_request/1";
+    fn validate(&self) -> Result<(), String> {
+        in_range("range_m[0]", self.range_m[0], 0.0, 100.0)?;
+        in_range("range_m[1]", self.range_m[1], self.range_m[0], 100.0)
+    }
 }
 
 impl Wire for StepRequest {

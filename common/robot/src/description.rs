@@ -1,5 +1,6 @@
 //! The robot file, field by field.
 
+use crate::{CameraMount, MastDescription, MobilityDescription, VehicleDynamics};
 use rover_cameras::StereoPair;
 use rover_vision::PlateLayout;
 use serde::{Deserialize, Serialize};
@@ -26,6 +27,12 @@ pub struct RobotDescription {
     /// The body to which the arm is mounted, for collision checks, rover frame.
     #[serde(default)]
     pub body: Vec<Capsule>,
+    /// The mast, if there is one.
+    #[serde(default)]
+    pub mast: Option<MastDescription>,
+    /// The wheels, if there are any.
+    #[serde(default)]
+    pub mobility: Option<MobilityDescription>,
     /// Masses and stiffnesses; only a simulator needs them.
     #[serde(default)]
     pub dynamics: Option<Dynamics>,
@@ -154,7 +161,11 @@ pub struct FiducialDescription {
 pub struct CameraPairDescription {
     /// Name of the pair, as in the keys.
     pub name: String,
-    /// Camera models, rover frame.
+    /// What the pair is mounted on.
+    #[serde(default, skip_serializing_if = "CameraMount::is_body")]
+    pub mount: CameraMount,
+    /// Camera models, in the frame of what the pair is mounted on: the rover frame or the mast's
+    /// head. [`crate::Robot::cameras_at`] places them.
     pub cameras: StereoPair,
     /// Nearest range at which surfaces are measured, m.
     pub range_min_m: f64,
@@ -170,6 +181,9 @@ pub struct Dynamics {
     pub gravity_m_s2: [f64; 3],
     /// One per joint.
     pub links: Vec<LinkDynamics>,
+    /// Body, suspension and wheels of a robot that drives.
+    #[serde(default)]
+    pub vehicle: Option<VehicleDynamics>,
 }
 
 /// Dynamics of one joint and its link.

@@ -7,7 +7,10 @@
 //! Every field is checked when a file is read and the message names the field, what was found and
 //! what was expected; unknown fields are refused.
 
+mod check;
 mod description;
+mod mobile;
+mod placing;
 mod robot;
 pub mod urdf;
 
@@ -15,5 +18,9 @@ pub use description::{
     ArmDescription, CameraPairDescription, Capsule, ContactSwitch, Dynamics, FiducialDescription,
     JointDescription, LinkDynamics, ModelQuality, PoseDescription, RobotDescription,
     ToolDescription,
+};
+pub use mobile::{
+    CameraMount, ComplianceDescription, MastDescription, MastQuality, MobilityDescription,
+    MobilityLimits, OdometryQuality, VehicleDynamics,
 };
 pub use robot::{Robot, RobotError};

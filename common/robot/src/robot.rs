@@ -1,7 +1,7 @@
 //! The checked robot and what is derived from its description.
 
-use crate::{CameraPairDescription, Capsule, PoseDescription, RobotDescription};
-use nalgebra::{Isometry3, Matrix3, Rotation3, Unit, UnitQuaternion, Vector3};
+use crate::{CameraPairDescription, PoseDescription, RobotDescription, check::Check};
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use rover_geometry::{ArmBase, Link, Rover, Transform};
 use rover_kinematics::{Arm, DhRow, JointLimits, Tool};
 use sha2::{Digest, Sha256};
@@ -35,6 +35,14 @@ pub enum RobotError {
         field: String,
         /// What was found and what was expected.
         message: String,
+    },
+    /// A part that the robot does not have.
+    #[error("the robot `{robot}` has no {section}")]
+    Lacks {
+        /// Name of the robot.
+        robot: String,
+        /// The missing section of its file.
+        section: &'static str,
     },
     /// A name that the robot does not have.
     #[error("no {kind} named `{name}`; the robot has: {known}")]
@@ -259,193 +267,4 @@ fn line_of(text: &str, field: &str) -> Option<usize> {
         };
     }
     Some(text.get(..offset?)?.matches('\n').count() + 1)
-}
-
-struct Check<'a> {
-    origin: &'a str,
-}
-
-impl Check<'_> {
-    fn error(&self, field: &str, message: impl Into<String>) -> RobotError {
-        RobotError::Field {
-            origin: self.origin.into(),
-            field: field.into(),
-            message: message.into(),
-        }
-    }
-
-    fn require(&self, ok: bool, field: &str, message: impl Into<String>) -> Result<(), RobotError> {
-        if ok {
-            Ok(())
-        } else {
-            Err(self.error(field, message))
-        }
-    }
-
-    fn positive(&self, field: &str, value: f64) -> Result<(), RobotError> {
-        self.require(
-            value.is_finite() && value > 0.0,
-            field,
-            format!("{value}, expected a positive number"),
-        )
-    }
-
-    fn direction(&self, field: &str, v: [f64; 3]) -> Result<Unit<Vector3<f64>>, RobotError> {
-        Unit::try_new(Vector3::from(v), 1e-9)
-            .filter(|u| u.iter().all(|x| x.is_finite()))
-            .ok_or_else(|| {
-                self.error(
-                    field,
-                    format!("{v:?}, expected a direction other than zero"),
-                )
-            })
-    }
-
-    fn capsules(&self, field: &str, capsules: &[Capsule]) -> Result<(), RobotError> {
-        for (i, c) in capsules.iter().enumerate() {
-            self.positive(&format!("{field}[{i}].radius_m"), c.radius_m)?;
-            let ends = c.from_m.iter().chain(&c.to_m);
-            self.require(
-                ends.clone().all(|x| x.is_finite()),
-                &format!("{field}[{i}]"),
-                "an end is not finite",
-            )?;
-        }
-        Ok(())
-    }
-
-    fn all(&self, d: &RobotDescription) -> Result<(), RobotError> {
-        let named = !d.name.is_empty()
-            && d.name
-                .chars()
-                .all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_');
-        self.require(
-            named,
-            "name",
-            format!("`{}`, expected lower-case letters, digits and `_`", d.name),
-        )?;
-        self.positive("model_quality.angle_deg", d.model_quality.angle_deg)?;
-        self.positive("model_quality.length_mm", d.model_quality.length_mm)?;
-        self.positive("arm.heartbeat_s", d.arm.heartbeat_s)?;
-        self.require(
-            d.arm.heartbeat_s <= 0.05,
-            "arm.heartbeat_s",
-            format!("{}, expected at most 0.05 s", d.arm.heartbeat_s),
-        )?;
-        for (i, j) in d.arm.joints.iter().enumerate() {
-            self.capsules(&format!("arm.joints[{i}].shape"), &j.shape)?;
-        }
-        self.capsules("body", &d.body)?;
-        let s = &d.tool.switch;
-        for (field, value) in [
-            ("tool.switch.ball_radius_m", s.ball_radius_m),
-            ("tool.switch.closes_at_m", s.closes_at_m),
-            ("tool.switch.spring_n_m", s.spring_n_m),
-            ("tool.switch.preload_n", s.preload_n),
-        ] {
-            self.positive(field, value)?;
-        }
-        self.require(
-            s.travel_m > s.closes_at_m,
-            "tool.switch.travel_m",
-            format!(
-                "{}, expected more than closes_at_m = {}",
-                s.travel_m, s.closes_at_m
-            ),
-        )?;
-        self.require(
-            !d.cameras.is_empty(),
-            "cameras",
-            "none, expected at least one pair",
-        )?;
-        for pair in &d.cameras {
-            for (side, camera) in [("left", &pair.cameras.left), ("right", &pair.cameras.right)] {
-                camera.validate().map_err(|e| {
-                    self.error(&format!("cameras.{}.{side}", pair.name), e.to_string())
-                })?;
-            }
-            self.positive(
-                &format!("cameras.{}.range_min_m", pair.name),
-                pair.range_min_m,
-            )?;
-            self.require(
-                pair.range_max_m > pair.range_min_m,
-                &format!("cameras.{}.range_max_m", pair.name),
-                format!("{}, expected more than range_min_m", pair.range_max_m),
-            )?;
-        }
-        self.postures(d)?;
-        self.dynamics(d)
-    }
-
-    fn postures(&self, d: &RobotDescription) -> Result<(), RobotError> {
-        for (name, q) in &d.postures {
-            let field = format!("postures.{name}");
-            self.require(
-                q.len() == d.arm.joints.len(),
-                &field,
-                format!("{} angles, expected {}", q.len(), d.arm.joints.len()),
-            )?;
-            for (joint, &angle) in d.arm.joints.iter().zip(q) {
-                self.require(
-                    (joint.lower_rad..=joint.upper_rad).contains(&angle),
-                    &field,
-                    format!(
-                        "{angle} rad for joint `{}`, expected {} to {}",
-                        joint.name, joint.lower_rad, joint.upper_rad
-                    ),
-                )?;
-            }
-        }
-        Ok(())
-    }
-
-    fn dynamics(&self, d: &RobotDescription) -> Result<(), RobotError> {
-        let Some(dynamics) = &d.dynamics else {
-            return Ok(());
-        };
-        self.require(
-            dynamics.links.len() == d.arm.joints.len(),
-            "dynamics.links",
-            format!(
-                "{}, expected one per joint ({})",
-                dynamics.links.len(),
-                d.arm.joints.len()
-            ),
-        )?;
-        for (i, link) in dynamics.links.iter().enumerate() {
-            for (field, value) in [
-                ("mass_kg", link.mass_kg),
-                ("stiffness_nm_rad", link.stiffness_nm_rad),
-                ("damping_nms_rad", link.damping_nms_rad),
-                ("max_torque_nm", link.max_torque_nm),
-                (
-                    "inertia_kg_m2",
-                    link.inertia_kg_m2.iter().copied().fold(f64::MAX, f64::min),
-                ),
-            ] {
-                self.positive(&format!("dynamics.links[{i}].{field}"), value)?;
-            }
-        }
-        Ok(())
-    }
-
-    fn plate(&self, d: &RobotDescription) -> Result<Isometry3<f64>, RobotError> {
-        let f = &d.fiducial;
-        f.layout
-            .validate()
-            .map_err(|e| self.error("fiducial.layout", e.to_string()))?;
-        let z = self.direction("fiducial.normal", f.normal)?.into_inner();
-        let right = Vector3::from(f.right);
-        let x = self
-            .direction("fiducial.right", (right - z * z.dot(&right)).into())?
-            .into_inner();
-        let axes = Matrix3::from_columns(&[x, z.cross(&x), z]);
-        let rotation =
-            UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
-        Ok(Isometry3::from_parts(
-            Vector3::from(f.centre_m).into(),
-            rotation,
-        ))
-    }
 }

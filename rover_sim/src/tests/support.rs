@@ -58,6 +58,7 @@ pub fn arm_model() -> ArmModel {
             Vector3::new(0.06, 0.16, 0.60).into(),
             UnitQuaternion::from_euler_angles(PI, 0.0, 0.0),
         ),
+        standing: None,
         links: (0..5)
             .map(|i| LinkDynamics {
                 mass_kg: mass[i],

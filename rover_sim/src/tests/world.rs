@@ -108,6 +108,7 @@ fn an_exact_robot_places_exactly_and_stops_in_the_step_of_contact() {
         .clone();
     let request = ScoreRequest {
         target: target(&surface),
+        handed_over: None,
         open_loop_joints_rad: Some(open_loop),
     };
     let score = world.score(&request).unwrap();
@@ -184,6 +185,7 @@ fn a_perturbed_robot_misses_by_its_model_error() {
         .clone();
     let request = ScoreRequest {
         target: target(&surface),
+        handed_over: None,
         open_loop_joints_rad: Some(open_loop),
     };
     let score = world.score(&request).unwrap();
@@ -237,7 +239,7 @@ fn a_stop_ends_the_motion_within_its_ramp_and_names_the_reason() {
             match world.advance(1) {
                 Advance::Moving => {}
                 Advance::Ended(outcome) => break outcome.unwrap_err(),
-                Advance::Idle => panic!("no motion"),
+                other => panic!("no arm motion: {other:?}"),
             }
         };
         assert_eq!(fault.name, name);
@@ -315,6 +317,7 @@ fn a_rock_that_vanishes_is_neither_felt_nor_seen() {
     let surface = surface(&mut world);
     let score = world.score(&ScoreRequest {
         target: target(&surface),
+        handed_over: None,
         open_loop_joints_rad: None,
     });
     let score = score.unwrap();

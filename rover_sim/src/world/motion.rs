@@ -137,7 +137,11 @@ impl World {
 
     pub(super) fn is_calm(&self) -> bool {
         let limit = self.description.driver.rest_rate_rad_s;
-        self.rates_rad_s.iter().all(|r| r.abs() < limit)
+        let tilt = self.arm.tilt_rates_rad_s().unwrap_or_default();
+        self.rates_rad_s
+            .iter()
+            .chain(&tilt)
+            .all(|r| r.abs() < limit)
     }
 
     /// Ends the motion; a stop on contact or force is a result, any other stop a fault.

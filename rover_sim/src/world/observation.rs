@@ -4,7 +4,7 @@
 use super::{Collision, World, lock};
 use crate::{
     driver::Phase,
-    eyes::{Eyes, Moment},
+    eyes::{Eyes, Moment, RoverMoment},
 };
 use nalgebra::Vector3;
 use rover_messages::{
@@ -50,10 +50,16 @@ impl World {
 
     /// The scene at this instant.
     pub fn moment(&self) -> Moment {
-        let mut part_poses: Vec<_> = (0..self.model.links.len())
-            .map(|i| self.arm.world_from_link(i))
-            .collect();
-        part_poses.push(self.arm.world_from_plunger());
+        let mut part_poses = self.arm_part_poses();
+        let rover = self.rover_moment();
+        if let (Some(rover), Some(vehicle)) = (&rover, &self.vehicle) {
+            part_poses.push(rover.world_from_rover);
+            part_poses.extend(vehicle.part_poses());
+            if let Some(mast) = &self.mast {
+                part_poses.push(rover.world_from_rover * mast.rover_from_pan());
+                part_poses.push(rover.world_from_rover * mast.rover_from_head());
+            }
+        }
         Moment {
             sim_time_s: self.sim_time_s(),
             step: self.step,
@@ -62,13 +68,25 @@ impl World {
                 pattern_visible: !self.is_fiducial_hidden(),
             },
             gone: self.gone.clone(),
+            rover,
         }
     }
 
+    fn rover_moment(&self) -> Option<RoverMoment> {
+        let world_from_rover = self.world_from_rover()?;
+        let head = self.mast.as_ref().map(|m| m.rover_from_head());
+        Some(RoverMoment {
+            world_from_rover,
+            world_from_head: head.map(|h| world_from_rover * h),
+            mast: self.mast_state(),
+            wheels: self.wheels_state()?,
+        })
+    }
+
     fn is_fiducial_hidden(&self) -> bool {
-        let occluded = match (&self.description.occlusion, &self.designated) {
-            (Some(o), Some((_, target))) => {
-                let apart = (self.arm.tip_in_world() - target.point_m).norm();
+        let occluded = match (&self.description.occlusion, self.designated.last()) {
+            (Some(o), Some(target)) => {
+                let apart = (self.arm.tip_in_world() - target.surface.point_m).norm();
                 apart < o.fiducial_hidden_within_m
             }
             _ => false,
@@ -107,6 +125,7 @@ impl World {
             rendering_wall_s: self.rendering_wall.load(Ordering::Relaxed) as f64 * 1e-9,
             steps: self.step,
             collision: self.collision.map(|c| (c.sim_time_s, c.link_n as u32)),
+            rover: self.true_rover(),
         }
     }
 

@@ -27,7 +27,7 @@ pub use surface::{Surface, SurfaceFailure, measure_surface};
 
 use crate::image::{Image8, ImageError, ImageF};
 use crate::ncc::SearchImage;
-use crate::sample::SplineImage;
+use crate::sample::{Sample, SplineImage};
 
 /// An image prepared for matching: make it once per image, use it for any number of matches.
 #[derive(Clone, Debug)]
@@ -51,6 +51,13 @@ impl PreparedImage {
             grey: SearchImage::whole(image, 0),
             spline: SplineImage::new(&working),
         })
+    }
+
+    /// Value and gradient between the pixels (cubic B-spline); `None` closer than one pixel to the
+    /// border.
+    #[must_use]
+    pub fn sample(&self, u_px: f64, v_px: f64) -> Option<Sample> {
+        self.spline.sample(u_px, v_px)
     }
 
     /// Width, px.

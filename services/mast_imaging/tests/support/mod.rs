@@ -93,6 +93,8 @@ pub fn raw_pair(pair: &CameraPairDescription) -> RawPair {
         step: 750,
         left: picture(&pair.cameras.left),
         right: picture(&pair.cameras.right),
+        mast: None,
+        wheels: None,
     }
 }
 

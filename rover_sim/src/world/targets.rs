@@ -1,0 +1,159 @@
+//! Places on the terrain: what a pixel shows, and places that a person might choose.
+
+use super::{World, lock};
+use crate::{SimulationError, eyes::SurfacePoint};
+use nalgebra::{Isometry3, Point3, Vector3};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rover_messages::{
+    Fault,
+    keys::service::HARDWARE,
+    simulation::{Pick, PickRequest, SurfaceKind, TruePlace},
+};
+
+/// Largest angle between a picked surface's normal and the direction towards the camera, rad.
+const FACING_RAD: f64 = 1.0;
+/// A picked surface on a rock lies so much above the ground at most, m.
+const HIGHEST_M: f64 = 0.30;
+/// Half the width of the field before the rover in which places are picked, rad.
+const AHEAD_RAD: f64 = 0.5;
+/// Rocks smaller than this are not picked, m.
+const ROCK_M: f64 = 0.10;
+
+/// What a pixel showed when it was named.
+#[derive(Clone, Debug)]
+pub(crate) struct Designation {
+    pair: String,
+    pixel_px: [u64; 2],
+    pub surface: SurfacePoint,
+    /// Where the rover was then.
+    pub world_from_rover: Isometry3<f64>,
+}
+
+impl World {
+    /// Names the pixel of the target: its true surface point is found now, before anything moves
+    /// or vanishes, and is what occlusion and scores refer to. The same pixel named again is
+    /// answered from memory.
+    ///
+    /// # Errors
+    /// [`SimulationError::NoSurface`].
+    pub fn designate(
+        &mut self,
+        pair: &str,
+        pixel_px: [f64; 2],
+    ) -> Result<SurfacePoint, SimulationError> {
+        self.designation(pair, pixel_px).map(|d| d.surface)
+    }
+
+    pub(crate) fn designation(
+        &mut self,
+        pair: &str,
+        pixel_px: [f64; 2],
+    ) -> Result<Designation, SimulationError> {
+        let bits = pixel_px.map(f64::to_bits);
+        let known = |d: &&Designation| d.pair == pair && d.pixel_px == bits;
+        if let Some(known) = self.designated.iter().find(known) {
+            return Ok(known.clone());
+        }
+        let surface = lock(&self.eyes).surface_at(&self.moment(), pair, pixel_px)?;
+        let new = Designation {
+            pair: pair.into(),
+            pixel_px: bits,
+            surface,
+            world_from_rover: self.world_from_rover().unwrap_or_else(Isometry3::identity),
+        };
+        self.designated.push(new.clone());
+        Ok(new)
+    }
+
+    /// The place of a surface point as seen from the rover now.
+    pub(crate) fn true_place(&self, surface: &SurfacePoint) -> TruePlace {
+        let origin = self
+            .world_from_rover()
+            .map_or_else(Vector3::zeros, |pose| pose.translation.vector);
+        let apart = surface.point_m - origin;
+        TruePlace {
+            point_in_world_m: surface.point_m.into(),
+            normal_in_world: surface.normal.into_inner().into(),
+            rock_n: surface.body_n.checked_sub(1).map(|n| n as u32),
+            range_m: apart.x.hypot(apart.y),
+        }
+    }
+
+    /// A place that a person might choose as a target: in view before the rover, on a face turned
+    /// to the mast. The same question has the same answer while nothing moves.
+    ///
+    /// # Errors
+    /// Fault `no_place` with the number of places tried.
+    pub fn pick(&self, request: &PickRequest) -> Result<Pick, Fault> {
+        const TRIES: u32 = 2000;
+        let world_from_rover = self.world_from_rover().unwrap_or_else(Isometry3::identity);
+        let eye = self.lookout(&world_from_rover);
+        let mut random = ChaCha8Rng::seed_from_u64(self.origin.0);
+        random.set_stream(40 + u64::from(request.choice_n));
+        let yaw = world_from_rover.rotation.euler_angles().2;
+        let [near, far] = request.range_m;
+        for _ in 0..TRIES {
+            let [u, v]: [f64; 2] = std::array::from_fn(|_| random.random());
+            let range = near + u * (far - near);
+            let azimuth = yaw + (2.0 * v - 1.0) * AHEAD_RAD;
+            let lift = 0.4 * random.random::<f64>();
+            let origin = world_from_rover.translation.vector;
+            let (x, y) = (
+                origin.x + range * azimuth.cos(),
+                origin.y + range * azimuth.sin(),
+            );
+            let ground = self.terrain.height_near_m(x, y);
+            let aim = match request.surface {
+                SurfaceKind::Rock => Vector3::new(x, y, ground + lift),
+                SurfaceKind::Ground => Vector3::new(x, y, ground),
+            };
+            let along = aim - eye;
+            let Some(found) = lock(&self.eyes).first_on(&eye, &along.normalize()) else {
+                continue;
+            };
+            let place = self.true_place(&found);
+            let height =
+                found.point_m.z - self.terrain.height_near_m(found.point_m.x, found.point_m.y);
+            let fits = match request.surface {
+                SurfaceKind::Ground => place.rock_n.is_none(),
+                SurfaceKind::Rock => {
+                    place.rock_n.is_some()
+                        && self.terrain.size_m(found.body_n) > 2.0 * ROCK_M
+                        && found.normal.angle(&-along) < FACING_RAD
+                        && (0.04..HIGHEST_M).contains(&height)
+                        && found.normal.z > 0.15
+                }
+            };
+            if !fits || !(near..=far).contains(&place.range_m) {
+                continue;
+            }
+            let in_rover = (world_from_rover.inverse() * Point3::from(found.point_m)).coords;
+            let mast_rad = self
+                .robot
+                .description()
+                .mast
+                .and_then(|mast| mast.angles_towards(&in_rover.into()));
+            let pixel_px = lock(&self.eyes).pixel_of(&self.moment(), &request.pair, &found.point_m);
+            return Ok(Pick {
+                place,
+                mast_rad,
+                pixel_px,
+            });
+        }
+        let message = format!(
+            "no {:?} between {near} and {far} m that faces the rover, {TRIES} places tried",
+            request.surface
+        );
+        Err(Fault::new(HARDWARE, "no_place", message).with("tried_n", f64::from(TRIES)))
+    }
+
+    /// Where the view is best: the mast's head, or the first pair.
+    fn lookout(&self, world_from_rover: &Isometry3<f64>) -> Vector3<f64> {
+        let in_rover = match &self.robot.description().mast {
+            Some(mast) => mast.rover_from_head(0.0, 0.0).isometry.translation.vector,
+            None => self.robot.mount_centre(),
+        };
+        (world_from_rover * Point3::from(in_rover)).coords
+    }
+}

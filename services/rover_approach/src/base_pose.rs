@@ -1,0 +1,424 @@
+//! The base pose from which the arm can serve the target best.
+//!
+//! Candidates lie on a fan about the target. Each is stood on the measured ground, which tilts the
+//! rover; there the target must be reachable along its normal within the joint limits, seen by both
+//! body cameras together with the fiducial, and the wheels clear. What is left is ranked by how
+//! freely the tip moves, how far the joints are from their limits, and how much lies between the
+//! wheels and the limits of the ground.
+
+use crate::obstacles::{GroundMap, PlanarPose, Standing};
+use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector2, Vector3};
+use rover_cameras::StereoPair;
+use rover_kinematics::{AxisGoal, solve_axis};
+use rover_robot::{CameraPairDescription, MobilityDescription, Robot};
+use std::collections::BTreeMap;
+
+/// How base poses are chosen.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BaseRules {
+    /// Nearest and farthest distance of the target ahead of the rover's origin, m.
+    pub ahead_m: [f64; 2],
+    /// Farthest to a side, m.
+    pub aside_m: f64,
+    /// Distance between candidates, m.
+    pub step_m: f64,
+    /// Headings tried about the direction to the target, rad, and their step.
+    pub heading_rad: [f64; 2],
+    /// Distance of the tip from the target before contact, m.
+    pub standoff_m: f64,
+    /// Distance of target and fiducial from the images' border, px.
+    pub border_px: f64,
+    /// Largest angle between the fiducial's normal and the direction to a camera, rad.
+    pub max_facing_rad: f64,
+    /// Least ratio of the tip's smallest to its largest free motion.
+    pub min_manipulability: f64,
+    /// Least distance of the joints from their limits, rad.
+    pub min_limit_rad: f64,
+    /// Steepest ground to work on, rad.
+    pub max_slope_rad: f64,
+}
+
+impl Default for BaseRules {
+    fn default() -> Self {
+        Self {
+            ahead_m: [0.80, 1.30],
+            aside_m: 0.25,
+            step_m: 0.05,
+            heading_rad: [0.5, 0.125],
+            standoff_m: 0.08,
+            border_px: 30.0,
+            max_facing_rad: 1.13,
+            min_manipulability: 0.05,
+            min_limit_rad: 0.05,
+            max_slope_rad: 0.26,
+        }
+    }
+}
+
+/// How well a base pose serves.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Serving {
+    /// The pose, present rover frame.
+    pub pose: PlanarPose,
+    /// How the rover stands there; none for the pose it already stands in.
+    pub standing: Option<Standing>,
+    /// Target in the rover frame there, m.
+    pub target_m: Vector3<f64>,
+    /// Joint angles at contact, rad.
+    pub joints_rad: Vec<f64>,
+    /// Ratio of the tip's smallest to its largest free motion at contact.
+    pub manipulability: f64,
+    /// Least distance of a joint from its limits, rad.
+    pub limit_rad: f64,
+    /// Angle between the fiducial's normal and the direction to the cameras at the standoff, rad.
+    pub facing_rad: f64,
+    /// The sum that candidates are ranked by; more is better.
+    pub score: f64,
+}
+
+/// Nothing serves the target: the conditions that refused candidates, and how many each.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("none of {candidates_n} base poses serves the target: {}", counted(.refused))]
+pub struct NoBase {
+    /// Candidates looked at.
+    pub candidates_n: u32,
+    /// Conditions and counts.
+    pub refused: BTreeMap<String, u32>,
+}
+
+fn counted(refused: &BTreeMap<String, u32>) -> String {
+    let mut all: Vec<_> = refused.iter().collect();
+    all.sort_by(|a, b| b.1.cmp(a.1).then(a.0.cmp(b.0)));
+    let parts: Vec<String> = all.iter().map(|(name, n)| format!("{name} {n}")).collect();
+    parts.join(", ")
+}
+
+/// All that serve, best first, and what refused the others.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BaseChoice {
+    /// Poses that serve, best first.
+    pub serving: Vec<Serving>,
+    /// Candidates looked at.
+    pub candidates_n: u32,
+    /// Conditions that refused the others, and how many each.
+    pub refused: BTreeMap<String, u32>,
+}
+
+/// What a base pose is judged with.
+#[derive(Clone, Copy, Debug)]
+pub struct BaseTask<'a> {
+    /// The robot as believed.
+    pub robot: &'a Robot,
+    /// Its wheels.
+    pub mobility: &'a MobilityDescription,
+    /// The pair that watches the arm.
+    pub body: &'a CameraPairDescription,
+    /// How to choose.
+    pub rules: &'a BaseRules,
+}
+
+/// The target in some rover frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TargetSpot {
+    /// Position, m.
+    pub position_m: Vector3<f64>,
+    /// Outward unit normal.
+    pub normal: Vector3<f64>,
+}
+
+impl BaseTask<'_> {
+    /// Looks for base poses from which `target` (present rover frame, gravity upright as `map`)
+    /// can be served.
+    ///
+    /// # Errors
+    /// [`NoBase`] with what refused the candidates.
+    pub fn choose(&self, target: &TargetSpot, map: &GroundMap) -> Result<BaseChoice, NoBase> {
+        let r = self.rules;
+        let towards = target.position_m.y.atan2(target.position_m.x);
+        let mut refused: BTreeMap<String, u32> = BTreeMap::new();
+        let mut serving = Vec::new();
+        let mut candidates_n = 0;
+        let count = |reach: f64, step: f64| (reach / step).round() as i32;
+        let turns = count(r.heading_rad[0], r.heading_rad[1]);
+        let aheads = count(r.ahead_m[1] - r.ahead_m[0], r.step_m);
+        let asides = count(r.aside_m, r.step_m);
+        for turn in -turns..=turns {
+            let heading_rad = towards + f64::from(turn) * r.heading_rad[1];
+            for i in 0..=aheads {
+                for j in -asides..=asides {
+                    let ahead = r.ahead_m[0] + f64::from(i) * r.step_m;
+                    let aside = f64::from(j) * r.step_m;
+                    // the origin from which the target lies ahead and aside by so much
+                    let turned = PlanarPose {
+                        x_m: 0.0,
+                        y_m: 0.0,
+                        heading_rad,
+                    }
+                    .at(ahead, aside);
+                    let pose = PlanarPose {
+                        x_m: target.position_m.x - turned.x,
+                        y_m: target.position_m.y - turned.y,
+                        heading_rad,
+                    };
+                    candidates_n += 1;
+                    match self.judge(&pose, target, map) {
+                        Ok(found) => serving.push(found),
+                        Err(name) => *refused.entry(name).or_default() += 1,
+                    }
+                }
+            }
+        }
+        if serving.is_empty() {
+            return Err(NoBase {
+                candidates_n,
+                refused,
+            });
+        }
+        serving.sort_by(|a: &Serving, b: &Serving| b.score.total_cmp(&a.score));
+        Ok(BaseChoice {
+            serving,
+            candidates_n,
+            refused,
+        })
+    }
+
+    /// How one pose serves.
+    ///
+    /// # Errors
+    /// The name of the first condition that is not met.
+    fn judge(
+        &self,
+        pose: &PlanarPose,
+        target: &TargetSpot,
+        map: &GroundMap,
+    ) -> Result<Serving, String> {
+        let standing = map
+            .standing(pose, self.mobility, self.rules.max_slope_rad)
+            .map_err(|hazard| hazard.name().to_string())?;
+        let here_from_there = placed(pose, &standing);
+        let there = here_from_there.inverse();
+        let spot = TargetSpot {
+            position_m: (there * Point3::from(target.position_m)).coords,
+            normal: there.rotation * target.normal,
+        };
+        let mut found = self.serve(&spot)?;
+        let room = 1.0 - standing.slope_rad / self.rules.max_slope_rad;
+        let way = Vector2::new(pose.x_m, pose.y_m).norm() + 0.5 * pose.heading_rad.abs();
+        found.score +=
+            0.3 * room + 0.5 * standing.belly_m.min(0.2) - 0.1 * way - standing.unevenness_m;
+        found.pose = *pose;
+        found.standing = Some(standing);
+        Ok(found)
+    }
+
+    /// How the rover serves a target from where it stands; `spot` is in its own frame.
+    ///
+    /// # Errors
+    /// The name of the first condition that is not met: `target_out_of_view`,
+    /// `target_out_of_reach`, `joint_limit`, `singular`, `fiducial_hidden`.
+    pub fn serve(&self, spot: &TargetSpot) -> Result<Serving, String> {
+        let r = self.rules;
+        let pair = &self.body.cameras;
+        self.sees(pair, &spot.position_m)
+            .then_some(())
+            .ok_or("target_out_of_view")?;
+        let robot = self.robot;
+        let base_from_rover = robot.rover_from_arm_base.isometry.inverse();
+        let axis = nalgebra::Unit::try_new(base_from_rover.rotation * -spot.normal, 1e-9)
+            .ok_or("target_out_of_reach")?;
+        let goal = |distance_m: f64| AxisGoal {
+            point: (base_from_rover * Point3::from(spot.position_m + spot.normal * distance_m))
+                .coords,
+            axis,
+        };
+        let contact =
+            solve_axis(&robot.arm, &robot.tool, &goal(0.0)).map_err(|_| "target_out_of_reach")?;
+        let standoff = solve_axis(&robot.arm, &robot.tool, &goal(r.standoff_m))
+            .map_err(|_| "target_out_of_reach")?;
+        let mut best: Option<Serving> = None;
+        let mut reason = "joint_limit";
+        for touch in &contact {
+            let Some(before) = standoff.iter().find(|s| s.branch == touch.branch) else {
+                continue;
+            };
+            let limit_rad = self
+                .limit(&touch.joints_rad)
+                .min(self.limit(&before.joints_rad));
+            if !(touch.within_limits && before.within_limits && limit_rad >= r.min_limit_rad) {
+                continue;
+            }
+            let manipulability = self.manipulability(&touch.joints_rad).unwrap_or(0.0);
+            if !(manipulability >= r.min_manipulability) {
+                reason = "singular";
+                continue;
+            }
+            let Some(facing_rad) = self.facing(pair, &before.joints_rad) else {
+                reason = "fiducial_hidden";
+                continue;
+            };
+            let score = manipulability.min(0.5)
+                + 0.5 * limit_rad.min(0.5)
+                + 0.5 * (1.0 - facing_rad / r.max_facing_rad);
+            if best.as_ref().is_none_or(|b| score > b.score) {
+                best = Some(Serving {
+                    pose: PlanarPose {
+                        x_m: 0.0,
+                        y_m: 0.0,
+                        heading_rad: 0.0,
+                    },
+                    standing: None,
+                    target_m: spot.position_m,
+                    joints_rad: touch.joints_rad.clone(),
+                    manipulability,
+                    limit_rad,
+                    facing_rad,
+                    score,
+                });
+            }
+        }
+        best.ok_or_else(|| reason.to_string())
+    }
+
+    fn sees(&self, pair: &StereoPair, point: &Vector3<f64>) -> bool {
+        [&pair.left, &pair.right].iter().all(|camera| {
+            let range = (point - camera.model.cahv()[0]).norm();
+            (self.body.range_min_m..=self.body.range_max_m).contains(&range)
+                && camera
+                    .project(point)
+                    .is_ok_and(|pixel| camera.contains(&pixel, self.rules.border_px))
+        })
+    }
+
+    /// Least distance of the joints from their limits, rad.
+    fn limit(&self, joints_rad: &[f64]) -> f64 {
+        let room = self.robot.arm.limits().iter().zip(joints_rad);
+        room.map(|(l, q)| (q - l.lower_rad).min(l.upper_rad - q))
+            .fold(f64::INFINITY, f64::min)
+    }
+
+    /// Ratio of the smallest to the largest singular value of the tip's Jacobian.
+    fn manipulability(&self, joints_rad: &[f64]) -> Option<f64> {
+        let tip = self.robot.tool.tip_in_link;
+        let jacobian = self.robot.arm.jacobian(joints_rad, &tip).ok()?;
+        let linear = jacobian.rows(0, 3);
+        let values = (linear * linear.transpose())
+            .fixed_view::<3, 3>(0, 0)
+            .symmetric_eigenvalues();
+        let ratio = (values.min().max(0.0) / values.max()).sqrt();
+        ratio.is_finite().then_some(ratio)
+    }
+
+    /// Angle between the fiducial's normal and the directions to the cameras, if both see the
+    /// whole plate.
+    fn facing(&self, pair: &StereoPair, joints_rad: &[f64]) -> Option<f64> {
+        let rover_from_link = self.robot.rover_from_link(joints_rad).ok()?;
+        let plate = rover_from_link.isometry * self.robot.link_from_plate;
+        let layout = &self.robot.description().fiducial.layout;
+        let (w, h) = (layout.half_width_m, layout.half_height_m);
+        let normal = plate.rotation * Vector3::z();
+        let mut worst: f64 = 0.0;
+        for camera in [&pair.left, &pair.right] {
+            for (x, y) in [(-w, -h), (w, -h), (-w, h), (w, h)] {
+                let corner = (plate * Point3::new(x, y, 0.0)).coords;
+                let pixel = camera.project(&corner).ok()?;
+                if !camera.contains(&pixel, 8.0) {
+                    return None;
+                }
+                worst = worst.max(normal.angle(&(camera.model.cahv()[0] - corner)));
+            }
+        }
+        (worst <= self.rules.max_facing_rad).then_some(worst)
+    }
+}
+
+/// Present rover frame from the frame of a rover that stands at `pose`.
+#[must_use]
+pub fn placed(pose: &PlanarPose, standing: &Standing) -> Isometry3<f64> {
+    let up = standing.normal;
+    let (s, c) = pose.heading_rad.sin_cos();
+    let ahead = Vector3::new(c, s, 0.0);
+    let x = (ahead - up * ahead.dot(&up)).normalize();
+    let axes = Matrix3::from_columns(&[x, up.cross(&x), up]);
+    let turn = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
+    Isometry3::from_parts(
+        Vector3::new(pose.x_m, pose.y_m, standing.height_m).into(),
+        turn,
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::expect_used)]
+    use super::*;
+    use crate::obstacles::tests::ground;
+
+    fn robot() -> Robot {
+        let text = include_str!("../../../scenarios/robots/rocky8.toml");
+        Robot::parse(text, "rocky8.toml").unwrap()
+    }
+
+    fn choose(target: [f64; 3], normal: [f64; 3], map: &GroundMap) -> Result<BaseChoice, NoBase> {
+        let robot = robot();
+        let task = BaseTask {
+            robot: &robot,
+            mobility: robot.mobility().unwrap(),
+            body: robot.pair("body").unwrap(),
+            rules: &BaseRules::default(),
+        };
+        let spot = TargetSpot {
+            position_m: target.into(),
+            normal: Vector3::from(normal).normalize(),
+        };
+        let choice = task.choose(&spot, map);
+        if let Ok(choice) = &choice {
+            // what was promised holds: the tip is on the target with the axis along the normal
+            for s in choice.serving.iter().step_by(7) {
+                let standing = s.standing.unwrap();
+                let there = placed(&s.pose, &standing);
+                let (tip, axis) = robot.tool.at(&robot.arm, &s.joints_rad).unwrap();
+                let base = there * robot.rover_from_arm_base.isometry;
+                let tip = (base * Point3::from(tip)).coords;
+                assert!((tip - spot.position_m).norm() < 1e-6);
+                assert!((base.rotation * axis.into_inner() + spot.normal).norm() < 1e-5);
+                robot.arm.check_limits(&s.joints_rad).unwrap();
+            }
+        }
+        choice
+    }
+
+    #[test]
+    fn a_target_on_open_ground_is_served_from_near_in_front_of_it() {
+        let choice = choose([2.2, 0.1, 0.0], [0.0, 0.0, 1.0], &ground(|_, _| 0.0)).unwrap();
+        let best = &choice.serving[0];
+        assert!((0.7..1.3).contains(&best.target_m.x), "{best:?}");
+        assert!(choice.serving.windows(2).all(|w| w[0].score >= w[1].score));
+    }
+
+    #[test]
+    fn a_rock_in_front_moves_the_base_aside() {
+        let open = ground(|_, _| 0.0);
+        let rock = ground(|x, y| {
+            if f64::hypot(x - 1.3, y - 0.35) < 0.12 {
+                0.4
+            } else {
+                0.0
+            }
+        });
+        let free = choose([2.2, 0.0, 0.0], [0.0, 0.0, 1.0], &open).unwrap();
+        let beside = choose([2.2, 0.0, 0.0], [0.0, 0.0, 1.0], &rock).unwrap();
+        assert!(beside.serving.len() < free.serving.len());
+        assert!(beside.refused.contains_key("obstacle") || beside.refused.contains_key("step"));
+    }
+
+    #[test]
+    fn what_cannot_be_served_says_why() {
+        let open = ground(|_, _| 0.0);
+        let away = choose([2.2, 0.0, 0.2], [1.0, 0.0, 0.0], &open).unwrap_err();
+        assert!(away.to_string().contains("none of"), "{away}");
+        let high = choose([2.2, 0.0, 1.6], [0.0, 0.0, 1.0], &open).unwrap_err();
+        assert!(high.refused.contains_key("target_out_of_view"), "{high}");
+        let steep = ground(|x, _| 0.5 * x);
+        let slope = choose([2.2, 0.0, 1.1], [-0.45, 0.0, 0.9], &steep).unwrap_err();
+        assert_eq!(slope.refused.keys().collect::<Vec<_>>(), ["slope"]);
+    }
+}

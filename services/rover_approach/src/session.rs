@@ -1,0 +1,596 @@
+//! One approach from designation to hand-over, as a sequence of stops.
+
+use crate::base_pose::{BaseChoice, BaseRules, BaseTask, Serving, TargetSpot};
+use crate::drive::{DriveRules, next_movement, towards_pose};
+use crate::filter::{Motion, TargetEstimate};
+use crate::first_ray::{FirstRayRules, first_ray};
+use crate::handover::{HandoverRules, hand_over};
+use crate::hardware::{Frame, Hardware, fault};
+use crate::obstacles::{GroundMap, GroundRules};
+use crate::report::{Budget, sighting, sigma_mm};
+use crate::service::unfit;
+use crate::surface::measure_plane;
+use crate::track::{Fix, TrackRules, Tracker};
+use nalgebra::{Isometry3, Matrix3, Point3, UnitQuaternion, Vector2, Vector3};
+use rover_geometry::{Point, tangent_basis};
+use rover_messages::{
+    Fault,
+    approach::{
+        ApproachActivity, ApproachStop, BasePose, DriveToFeedback, DriveToGoal, DriveToResult,
+    },
+    mobility::{DriveArc, DriveResult, WheelsState},
+    target::Target,
+};
+use rover_robot::{MastDescription, MobilityDescription, Robot};
+use rover_vision::{MatchRules, sparse_points};
+use std::sync::Arc;
+
+/// Range at which the base pose is chosen, m along the ground.
+const NEAR_M: f64 = 2.6;
+/// Distance from the target that is aimed at before, m.
+const STANDOFF_M: f64 = 1.1;
+/// Where the ground is looked at before each movement, m ahead.
+const HAZARD_LOOK_M: f64 = 2.0;
+/// Pixels between the points of the ground map.
+const MAP_STEP_PX: u32 = 16;
+/// Frames whose points are kept.
+const MAP_FRAMES: usize = 6;
+/// Most stops if the goal does not say.
+const MAX_STOPS_N: u32 = 60;
+/// Close enough to the chosen base pose: m, rad.
+const ARRIVED: (f64, f64) = (0.06, 0.08);
+/// Movements near the target after which any pose that serves is taken.
+const PATIENCE_N: u32 = 10;
+
+pub(crate) struct Session<'a> {
+    hardware: Hardware<'a>,
+    goal: &'a DriveToGoal,
+    robot: &'a Robot,
+    mast: &'a MastDescription,
+    mobility: &'a MobilityDescription,
+    rules: DriveRules,
+    tracker: Tracker,
+    estimate: TargetEstimate,
+    now: Frame,
+    wheels: WheelsState,
+    /// Points of the last frames, site frame, m.
+    ground: Vec<Vec<Vector3<f64>>>,
+    stops: Vec<ApproachStop>,
+    budget: Budget,
+    driven_m: f64,
+    spot_offset_m: Option<Vector3<f64>>,
+    near_moves_n: u32,
+}
+
+impl<'a> Session<'a> {
+    /// Drives to the goal's target.
+    pub async fn run(
+        hardware: Hardware<'a>,
+        robot: &'a Robot,
+        goal: &'a DriveToGoal,
+    ) -> Result<DriveToResult, Fault> {
+        let mobility = robot.mobility().map_err(|e| unfit(&e))?;
+        let mast = robot.mast().map_err(|e| unfit(&e))?;
+        let pair = robot.pair(&goal.target.pair).map_err(|e| unfit(&e))?;
+        let now = hardware.recall(&goal.anchor).await?;
+        let wheels = wheels_of(&now)?;
+        let pixel = Vector2::from(goal.target.pixel_px);
+        let tracker = Tracker::designate(
+            Arc::clone(&now.view),
+            pixel,
+            [pair.range_min_m, 1.5 * pair.range_max_m],
+            TrackRules::default(),
+        )
+        .map_err(|e| fault("target_not_trackable", e.to_string()))?;
+        let (_, surface) = tracker.target();
+        let estimate = TargetEstimate::new(surface.plane.point, surface.covariance_m2)
+            .map_err(|e| fault("target_not_trackable", e.to_string()))?;
+        let mut rules = DriveRules::of(mobility);
+        if let Some(step) = goal.limits.step_fraction {
+            rules.step_fraction = step;
+        }
+        if let Some(slope) = goal.limits.max_slope_rad {
+            rules.max_slope_rad = slope;
+        }
+        let focal_px = now.view.cameras.left.model.cahv()[2].norm();
+        let mut session = Self {
+            hardware,
+            goal,
+            robot,
+            mast,
+            mobility,
+            rules,
+            budget: Budget::designated(surface, focal_px),
+            tracker,
+            estimate,
+            now,
+            wheels,
+            ground: Vec::new(),
+            stops: Vec::new(),
+            driven_m: 0.0,
+            spot_offset_m: None,
+            near_moves_n: 0,
+        };
+        session.approach().await
+    }
+
+    async fn approach(&mut self) -> Result<DriveToResult, Fault> {
+        self.remember_ground();
+        loop {
+            let range_m = self.estimate.position_m.xy().norm();
+            self.tell(ApproachActivity::Planning, None, None);
+            self.look_ahead().await?;
+            let arc = if range_m > NEAR_M {
+                self.far_movement(range_m)?
+            } else {
+                match self.near_movement()? {
+                    NearStep::Move(arc) => arc,
+                    NearStep::Stay(serving, choice) => {
+                        return self.finish(serving, choice).await;
+                    }
+                }
+            };
+            let limit = self.goal.limits.max_stops_n.unwrap_or(MAX_STOPS_N);
+            if self.stops.len() as u32 >= limit {
+                return Err(fault("too_many_stops", format!("{limit} stops made")));
+            }
+            self.tell(ApproachActivity::Driving, None, None);
+            let done = self.hardware.drive(arc, self.goal.limits.max_slip).await?;
+            self.after_drive(&done, range_m <= NEAR_M).await?;
+        }
+    }
+
+    /// An arc towards a place in front of the target.
+    fn far_movement(&self, range_m: f64) -> Result<DriveArc, Fault> {
+        let level = self.level_from_rover();
+        let target = (level * Point3::from(self.estimate.position_m)).coords.xy();
+        let goal = target * (1.0 - STANDOFF_M / target.norm());
+        next_movement(&goal, range_m, &self.map(), self.mobility, &self.rules)
+            .map(|m| m.arc)
+            .map_err(|blocked| fault("path_blocked", blocked.to_string()).with("range_m", range_m))
+    }
+
+    /// The movement to the best base pose that can be driven to, or the decision to stay.
+    fn near_movement(&mut self) -> Result<NearStep, Fault> {
+        let (_, surface) = self.tracker.target();
+        let spot = TargetSpot {
+            position_m: self.estimate.position_m,
+            normal: surface.plane.normal,
+        };
+        let map = self.map();
+        let (spot, choice) = match self.choose(&spot, &map) {
+            Ok(choice) => (spot, choice),
+            Err(refusal) => self.other_spot(&map).ok_or(refusal)?,
+        };
+        let body = self.robot.pair("body").map_err(|e| unfit(&e))?;
+        let base_rules = BaseRules::default();
+        let task = BaseTask {
+            robot: self.robot,
+            mobility: self.mobility,
+            body,
+            rules: &base_rules,
+        };
+        let here = task.serve(&spot);
+        if let (Ok(serving), Some(best)) = (&here, choice.serving.first()) {
+            let away = Vector2::new(best.pose.x_m, best.pose.y_m).norm();
+            let arrived = away <= ARRIVED.0 && best.pose.heading_rad.abs() <= ARRIVED.1;
+            if arrived || self.near_moves_n >= PATIENCE_N {
+                return Ok(NearStep::Stay(serving.clone(), choice));
+            }
+        }
+        self.near_moves_n += 1;
+        let range_m = self.estimate.position_m.xy().norm();
+        let step_m = (self.rules.step_fraction * range_m).max(0.15);
+        // the best first; the next ones are the second candidates if the way to it is blocked
+        let movement = choice.serving.iter().take(200).find_map(|serving| {
+            towards_pose(&serving.pose, step_m, &map, self.mobility, &self.rules)
+        });
+        match (movement, here) {
+            (Some(movement), _) => Ok(NearStep::Move(movement.arc)),
+            (None, Ok(serving)) => Ok(NearStep::Stay(serving, choice)),
+            (None, Err(reason)) => Err(fault(
+                "path_blocked",
+                format!(
+                    "no way is clear to any of {} base poses; where the rover stands: {reason}",
+                    choice.serving.len()
+                ),
+            )),
+        }
+    }
+
+    fn choose(&self, spot: &TargetSpot, map: &GroundMap) -> Result<BaseChoice, Fault> {
+        let body = self.robot.pair("body").map_err(|e| unfit(&e))?;
+        let rules = BaseRules::default();
+        let task = BaseTask {
+            robot: self.robot,
+            mobility: self.mobility,
+            body,
+            rules: &rules,
+        };
+        let level = self.level_from_rover();
+        let levelled = TargetSpot {
+            position_m: (level * Point3::from(spot.position_m)).coords,
+            normal: level.rotation * spot.normal,
+        };
+        task.choose(&levelled, map).map_err(|none| {
+            let mut found = fault("no_base_pose", none.to_string())
+                .with("candidates_n", f64::from(none.candidates_n));
+            for (name, n) in &none.refused {
+                found = found.with(&format!("{name}_n"), f64::from(*n));
+            }
+            found
+        })
+    }
+
+    /// Another spot within the goal's radius that some base pose serves; the tracker goes over to
+    /// it.
+    fn other_spot(&mut self, map: &GroundMap) -> Option<(TargetSpot, BaseChoice)> {
+        let radius_m = self.goal.spot_radius_m;
+        if radius_m <= 0.0 {
+            return None;
+        }
+        let surface = *self.tracker.target().1;
+        let plane = surface.plane;
+        let unit = nalgebra::Unit::try_new(plane.normal, 1e-9)?;
+        let (a, b) = tangent_basis(&unit);
+        let view = Arc::clone(&self.now.view);
+        let camera = &view.cameras.left;
+        for part in [0.5, 1.0] {
+            for k in 0..8 {
+                let angle = f64::from(k) * std::f64::consts::FRAC_PI_4;
+                let offset = (a * angle.cos() + b * angle.sin()) * (part * radius_m);
+                let Ok(pixel) = camera.project(&(plane.point + offset)) else {
+                    continue;
+                };
+                let range = surface.range_m;
+                let rules = &self.tracker.rules().plane;
+                let Ok(there) =
+                    measure_plane(&view, &pixel, [0.7 * range, 1.4 * range], None, rules)
+                else {
+                    continue;
+                };
+                let spot = TargetSpot {
+                    position_m: there.plane.point,
+                    normal: there.plane.normal,
+                };
+                let moved = there.plane.point - plane.point;
+                if moved.norm() > radius_m * 1.2 {
+                    continue;
+                }
+                if let Ok(choice) = self.choose(&spot, map)
+                    && self.tracker.move_to(&view, pixel).is_ok()
+                {
+                    self.estimate.position_m = there.plane.point;
+                    self.spot_offset_m = Some(moved);
+                    return Some((spot, choice));
+                }
+            }
+        }
+        None
+    }
+
+    /// After a movement: where is the target now, and is everything within its limits?
+    async fn after_drive(&mut self, done: &DriveResult, near: bool) -> Result<(), Fault> {
+        let way = match done.before_from_after().isometry.translation.vector.norm() {
+            way if way.is_finite() => way,
+            other => return Err(fault("bad_odometry", format!("a way of {other} m"))),
+        };
+        self.driven_m += way;
+        if let Some(stop) = &done.stop_reason {
+            let name = match stop {
+                rover_messages::mobility::DriveStop::Slip { .. } => "slip",
+                rover_messages::mobility::DriveStop::Tilt { .. } => "tilt",
+                _ => "drive_stopped",
+            };
+            return Err(
+                fault(name, format!("the drive ended early: {stop}")).with("slip", done.state.slip)
+            );
+        }
+        if let Some(limit) = self.goal.limits.max_distance_m
+            && self.driven_m > limit
+        {
+            return Err(fault(
+                "too_far",
+                format!("driven {:.2} m, limit {limit:.2} m", self.driven_m),
+            ));
+        }
+        let now_from_last = done.before_from_after().isometry.inverse();
+        let motion = Motion::from_drive(now_from_last, &done.covariance, done.state.tilt_sigma_rad);
+        self.estimate = self.estimate.predicted(&motion);
+        self.track(&motion, near).await?;
+        let sigma = sigma_mm(&self.estimate.covariance_m2);
+        let worst = sigma.iter().fold(0.0_f64, |m, s| m.max(*s));
+        if let Some(limit) = self.goal.limits.max_sigma_mm
+            && near
+            && worst > limit
+        {
+            return Err(fault(
+                "target_uncertain",
+                format!("the target is uncertain by {worst:.1} mm, limit {limit} mm"),
+            )
+            .with("sigma_mm", worst));
+        }
+        Ok(())
+    }
+
+    /// Points the mast at the target, takes an image, finds the target; another image of the same
+    /// stop after a refusal.
+    async fn track(&mut self, motion: &Motion, near: bool) -> Result<(), Fault> {
+        self.point_at(&self.estimate.position_m.clone()).await?;
+        let mut sightings = Vec::new();
+        for exposure_n in 0..2 {
+            let frame = self
+                .hardware
+                .capture(&self.goal.target.pair, exposure_n)
+                .await?;
+            let wheels = wheels_of(&frame)?;
+            let camera = &frame.view.cameras.left;
+            let focal_px = camera.model.cahv()[2].norm();
+            let pointing = 1.5 * self.mast.quality.pointing_deg.to_radians() * focal_px;
+            let spread = self
+                .estimate
+                .pixel_covariance(camera, pointing)
+                .ok_or_else(|| fault("target_lost", "the target is behind the camera"))?;
+            let predicted_px = self.tracker.predicted_pixel(camera, &motion.now_from_last);
+            let found = self
+                .tracker
+                .update(&frame.view, &motion.now_from_last, &spread, near);
+            sightings.push(sighting(
+                &frame.reference,
+                predicted_px,
+                &spread,
+                self.tracker.rules().search_sigma,
+                &found,
+                exposure_n > 0,
+            ));
+            let fix = match found {
+                Ok(fix) => fix,
+                Err(refusal) if exposure_n > 0 => {
+                    let range_m = self.estimate.position_m.xy().norm();
+                    return Err(fault("target_lost", refusal.to_string()).with("range_m", range_m));
+                }
+                Err(_) => continue,
+            };
+            self.estimate
+                .update(&fix.surface.plane.point, &fix.surface.covariance_m2)
+                .map_err(|e| fault("target_lost", e.to_string()))?;
+            // what the tracked pixel says counts; the filter is for the prediction
+            self.estimate.position_m = fix.surface.plane.point;
+            self.budget.tracked(&fix, focal_px);
+            (self.now, self.wheels) = (frame, wheels);
+            self.remember_ground();
+            self.record(sightings, &fix);
+            return Ok(());
+        }
+        Err(fault("target_lost", "no image was accepted"))
+    }
+
+    fn record(&mut self, sightings: Vec<rover_messages::approach::Sighting>, fix: &Fix) {
+        let stop_n = self.stops.len() as u32 + 1;
+        self.stops.push(ApproachStop {
+            stop_n,
+            sim_time_s: self.now.frame.images.sim_time_s,
+            pose: self.wheels.pose,
+            range_m: self.estimate.position_m.xy().norm(),
+            sightings,
+            position_m: self.estimate.position_m.into(),
+            sigma_mm: sigma_mm(&self.estimate.covariance_m2),
+            slip: self.wheels.slip,
+        });
+        let pixel = fix.pixel_px;
+        self.tell(
+            ApproachActivity::Tracking,
+            Some(pixel.into()),
+            Some(fix.score),
+        );
+    }
+
+    /// First ray, hand-over, and the target as the body pair sees it.
+    async fn finish(
+        &mut self,
+        serving: Serving,
+        choice: BaseChoice,
+    ) -> Result<DriveToResult, Fault> {
+        self.tell(ApproachActivity::HandingOver, None, None);
+        let view = Arc::clone(&self.now.view);
+        if self.spot_offset_m.is_none()
+            && let Ok(met) = first_ray(&self.tracker, &view, &FirstRayRules::default())
+            && met.sigma_m < self.budget.tracking_m()
+            && self.tracker.move_to(&view, met.pixel_px).is_ok()
+        {
+            self.budget.met(&met);
+        }
+        let body = self.hardware.capture("body", 0).await?;
+        let (pixel, surface) = self.tracker.target();
+        let found = hand_over(&view, pixel, surface, &body.view, &HandoverRules::default())
+            .map_err(|e| fault("handover_failed", e.to_string()))?;
+        let focal_px = body.view.cameras.left.model.cahv()[2].norm();
+        self.budget.handed(&found, focal_px);
+        let mut target = self.acceptable(&found.pixel_px, &found.surface).await?;
+        let lateral = self.budget.lateral_m();
+        let n = target.normal.unit.into_inner();
+        let spread = (Matrix3::identity() - n * n.transpose()) * (lateral * lateral);
+        for (i, row) in target.covariance_m2.iter_mut().enumerate() {
+            for (j, value) in row.iter_mut().enumerate() {
+                *value += spread[(i, j)];
+            }
+        }
+        let quality = [
+            ("manipulability", serving.manipulability),
+            ("joint_limit_margin_rad", serving.limit_rad),
+            ("fiducial_facing_rad", serving.facing_rad),
+            (
+                "tilt_rad",
+                self.wheels.pose.roll_rad.hypot(self.wheels.pose.pitch_rad),
+            ),
+        ];
+        Ok(DriveToResult {
+            target,
+            spot_offset_m: self.spot_offset_m.map(Into::into),
+            budget: self.budget.shares(),
+            handover_px: (found.pixel_px - found.geometric_px).norm(),
+            base: BasePose {
+                pose: self.wheels.pose,
+                quality: quality.map(|(name, x)| (name.to_string(), x)).into(),
+                candidates_n: choice.candidates_n,
+                refused: choice.refused,
+            },
+            stops: self.stops.clone(),
+            driven_m: self.driven_m,
+        })
+    }
+
+    /// The target at the handed-over pixel; if the surface there is refused, a spot near it that is
+    /// not, within the goal's radius.
+    async fn acceptable(
+        &mut self,
+        pixel_px: &Vector2<f64>,
+        surface: &crate::surface::StereoPlane,
+    ) -> Result<Target, Fault> {
+        let refusal = match self.hardware.select("body", (*pixel_px).into()).await {
+            Ok(target) => return Ok(target),
+            Err(refusal) => refusal,
+        };
+        let radius_m = self.goal.spot_radius_m;
+        let Some(unit) = nalgebra::Unit::try_new(surface.plane.normal, 1e-9) else {
+            return Err(refusal);
+        };
+        if radius_m <= 0.0 {
+            return Err(refusal);
+        }
+        let (a, b) = tangent_basis(&unit);
+        let pair = self.robot.pair("body").map_err(|e| unfit(&e))?;
+        for part in [0.5, 1.0] {
+            for k in 0..8 {
+                let angle = f64::from(k) * std::f64::consts::FRAC_PI_4;
+                let offset = (a * angle.cos() + b * angle.sin()) * (part * radius_m);
+                let Ok(pixel) = pair.cameras.left.project(&(surface.plane.point + offset)) else {
+                    continue;
+                };
+                if let Ok(target) = self.hardware.select("body", pixel.into()).await {
+                    let moved = target.position_m.coords - surface.plane.point;
+                    self.spot_offset_m = Some(self.spot_offset_m.unwrap_or_default() + moved);
+                    return Ok(target);
+                }
+            }
+        }
+        Err(refusal)
+    }
+
+    async fn point_at(&self, place: &Vector3<f64>) -> Result<(), Fault> {
+        let angles = self.mast.angles_towards(&Point::from(*place));
+        let [pan, tilt] = angles.ok_or_else(|| {
+            fault(
+                "target_lost",
+                "the target is too near to the mast to look at",
+            )
+        })?;
+        let within = |x: f64, limits: [f64; 2]| x.clamp(limits[0], limits[1]);
+        let [pan_rad, tilt_rad] = [
+            within(pan, self.mast.pan_rad),
+            within(tilt, self.mast.tilt_rad),
+        ];
+        self.hardware.point(pan_rad, tilt_rad).await
+    }
+
+    /// Looks at the ground that the next movement leads over, unless the target's own image shows
+    /// it.
+    async fn look_ahead(&mut self) -> Result<(), Fault> {
+        self.tell(ApproachActivity::Looking, None, None);
+        let bearing = self.estimate.position_m.xy().normalize();
+        let range_m = self.estimate.position_m.xy().norm();
+        if range_m < HAZARD_LOOK_M {
+            return Ok(());
+        }
+        let place = bearing * HAZARD_LOOK_M;
+        self.point_at(&Vector3::new(place.x, place.y, 0.0)).await?;
+        let frame = self.hardware.capture(&self.goal.target.pair, 0).await?;
+        self.remember(&frame);
+        Ok(())
+    }
+
+    fn remember_ground(&mut self) {
+        let frame = self.now.clone();
+        self.remember(&frame);
+    }
+
+    /// Adds a frame's points to the ground known; those of old frames are forgotten.
+    fn remember(&mut self, frame: &Frame) {
+        let Some(site_from_rover) = frame.frame.site_from_rover() else {
+            return;
+        };
+        let view = &frame.view;
+        let rules = MatchRules {
+            range_min_m: 0.9,
+            range_max_m: 8.0,
+            ..MatchRules::default()
+        };
+        let points = sparse_points(&view.left, &view.right, &view.cameras, MAP_STEP_PX, &rules);
+        let Ok(points) = points else { return };
+        let in_site = points
+            .iter()
+            .map(|(_, p)| (site_from_rover.isometry * Point3::from(*p)).coords)
+            .collect();
+        self.ground.push(in_site);
+        if self.ground.len() > MAP_FRAMES {
+            self.ground.remove(0);
+        }
+    }
+
+    /// The ground known, in the levelled rover frame.
+    fn map(&self) -> GroundMap {
+        let pose = &self.wheels.pose;
+        let turn = UnitQuaternion::from_euler_angles(0.0, 0.0, pose.heading_rad);
+        let site_from_level = Isometry3::from_parts(pose.position_m.coords.into(), turn);
+        let level_from_site = site_from_level.inverse();
+        let points: Vec<Vector3<f64>> = self
+            .ground
+            .iter()
+            .flatten()
+            .map(|p| (level_from_site * Point3::from(*p)).coords)
+            .collect();
+        GroundMap::from_points(&points, GroundRules::default())
+    }
+
+    /// The rover frame without roll and pitch, from the rover frame.
+    fn level_from_rover(&self) -> Isometry3<f64> {
+        let pose = &self.wheels.pose;
+        UnitQuaternion::from_euler_angles(pose.roll_rad, pose.pitch_rad, 0.0).into_isometry()
+    }
+
+    fn tell(&self, activity: ApproachActivity, pixel_px: Option<[f64; 2]>, score: Option<f64>) {
+        self.hardware.context.feedback(DriveToFeedback {
+            activity,
+            stop_n: self.stops.len() as u32,
+            range_m: self.estimate.position_m.xy().norm(),
+            pixel_px,
+            sigma_mm: sigma_mm(&self.estimate.covariance_m2),
+            score,
+        });
+    }
+}
+
+enum NearStep {
+    Move(DriveArc),
+    Stay(Serving, BaseChoice),
+}
+
+/// A rotation as a transform.
+trait IntoIsometry {
+    fn into_isometry(self) -> Isometry3<f64>;
+}
+
+impl IntoIsometry for UnitQuaternion<f64> {
+    fn into_isometry(self) -> Isometry3<f64> {
+        Isometry3::from_parts(nalgebra::Translation3::identity(), self)
+    }
+}
+
+fn wheels_of(frame: &Frame) -> Result<WheelsState, Fault> {
+    frame.frame.images.wheels.clone().ok_or_else(|| {
+        fault(
+            "no_odometry",
+            "the frame carries no odometry: the hardware has no wheels",
+        )
+    })
+}

@@ -1,0 +1,552 @@
+//! The target, found again in each new image of the approach.
+//!
+//! An anchor is a template cut where the target was last anchored, with the plane that stereo saw
+//! there. At each stop its warp is carried along by the odometry, searched for over the covariance
+//! of the prediction, aligned to subpixel, and put onto the plane that stereo sees now. When the
+//! range has shrunk enough the target is anchored anew, after the relief correction.
+
+use crate::align::{AlignRules, Freedom, Template, refine, search};
+use crate::error::TrackError;
+use crate::patch::HalfSize;
+use crate::relief::{AnchorGeometry, ReliefRules, corrected_pixel};
+use crate::surface::{PlaneRules, StereoPlane, measure_plane};
+use crate::view::View;
+use crate::warp::{PlaneWarp, SurfacePlane};
+use nalgebra::{Isometry3, Matrix2, Vector2};
+use std::sync::Arc;
+
+/// How the target is tracked.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TrackRules {
+    /// Half side of the template, px; flattened by the foreshortening, never below
+    /// [`Self::min_half_px`].
+    pub half_px: usize,
+    /// Smallest half side, px.
+    pub min_half_px: usize,
+    /// Anchor anew when the anchor's range is so many times the present one.
+    pub anchor_ratio: f64,
+    /// Least weighted correlation of an accepted match.
+    pub min_score: f64,
+    /// Farthest that tracking back may end from the anchor pixel, anchor px.
+    pub max_back_px: f64,
+    /// Search reach in standard deviations of the prediction.
+    pub search_sigma: f64,
+    /// Least correlation of the template's own stereo match: less is no plane.
+    pub min_plane_score: f64,
+    /// Least correlation in the search.
+    pub min_search_score: f64,
+    /// Bounds of the alignment.
+    pub align: AlignRules,
+    /// How planes are measured.
+    pub plane: PlaneRules,
+    /// How the relief is measured; none: no relief correction.
+    pub relief: Option<ReliefRules>,
+}
+
+impl Default for TrackRules {
+    fn default() -> Self {
+        Self {
+            half_px: 12,
+            min_half_px: 7,
+            anchor_ratio: 1.4,
+            min_score: 0.80,
+            max_back_px: 0.85,
+            search_sigma: 3.5,
+            min_plane_score: 0.5,
+            min_search_score: 0.4,
+            align: AlignRules::default(),
+            plane: PlaneRules::default(),
+            relief: Some(ReliefRules::default()),
+        }
+    }
+}
+
+/// A place in an image at which the target was anchored.
+#[derive(Clone, Debug)]
+pub struct Anchor {
+    /// The view it was anchored in.
+    pub view: Arc<View>,
+    /// The target's pixel there.
+    pub pixel_px: Vector2<f64>,
+    /// Range then, m.
+    pub range_m: f64,
+    /// The template.
+    pub template: Template,
+    /// The template's warp, present rover frame.
+    pub warp: PlaneWarp,
+    /// Present rover frame to that of the view, as odometry and matches say.
+    pub anchor_from_rover: Isometry3<f64>,
+}
+
+/// How a fix was obtained.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Attempt {
+    /// Translation, then affine.
+    Affine,
+    /// Translation only.
+    Translation,
+    /// With the anchor before the last one.
+    PreviousAnchor,
+}
+
+/// The target found again.
+#[derive(Clone, Debug)]
+pub struct Fix {
+    /// Pixel in the left image.
+    pub pixel_px: Vector2<f64>,
+    /// Surface there, from stereo.
+    pub surface: StereoPlane,
+    /// Weighted correlation with the anchor.
+    pub score: f64,
+    /// Best correlation elsewhere in the search.
+    pub second_score: f64,
+    /// How far tracking back ends from the anchor pixel, anchor px.
+    pub back_px: f64,
+    /// Distance from the prediction, px.
+    pub innovation_px: Vector2<f64>,
+    /// That distance in standard deviations of the prediction.
+    pub innovation_sigma: f64,
+    /// Standard deviation of the pixel, px.
+    pub sigma_px: f64,
+    /// What succeeded.
+    pub attempt: Attempt,
+    /// Whether the target was anchored anew here.
+    pub anchored: bool,
+    /// Move of the hit by the relief correction, px.
+    pub relief_px: Vector2<f64>,
+}
+
+/// A stop at which the target was not found: every attempt with its reason.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Refusal {
+    /// Attempts in order.
+    pub attempts: Vec<(Attempt, TrackError)>,
+}
+
+impl std::fmt::Display for Refusal {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        for (i, (attempt, error)) in self.attempts.iter().enumerate() {
+            let separator = if i == 0 { "" } else { "; " };
+            let name = match attempt {
+                Attempt::Affine => "affine",
+                Attempt::Translation => "translation only",
+                Attempt::PreviousAnchor => "previous anchor",
+            };
+            write!(f, "{separator}{name}: {error}")?;
+        }
+        Ok(())
+    }
+}
+
+impl std::error::Error for Refusal {}
+
+/// Keeps a target through the stops of an approach.
+#[derive(Clone, Debug)]
+pub struct Tracker {
+    rules: TrackRules,
+    first: Anchor,
+    /// Newest last; at most two.
+    anchors: Vec<Anchor>,
+    pixel_px: Vector2<f64>,
+    surface: StereoPlane,
+}
+
+/// A fix before it is accepted.
+struct Candidate {
+    warp: PlaneWarp,
+    pixel_px: Vector2<f64>,
+    surface: StereoPlane,
+    score: f64,
+    second_score: f64,
+    back_px: f64,
+    sigma_px: f64,
+}
+
+impl Tracker {
+    /// Takes up a target designated at `pixel_px` of a view's left image; its surface is searched
+    /// between the two ranges (m).
+    ///
+    /// # Errors
+    /// [`TrackError`] if the window leaves the image or has no plane.
+    pub fn designate(
+        view: Arc<View>,
+        pixel_px: Vector2<f64>,
+        range_m: [f64; 2],
+        rules: TrackRules,
+    ) -> Result<Self, TrackError> {
+        let surface = measure_plane(&view, &pixel_px, range_m, None, &rules.plane)?;
+        if surface.score < rules.min_plane_score {
+            return Err(TrackError::NotPlanar {
+                score: surface.score,
+                limit: rules.min_plane_score,
+            });
+        }
+        let first = anchor(view, pixel_px, &surface, &rules)?;
+        Ok(Self {
+            rules,
+            anchors: vec![first.clone()],
+            first,
+            pixel_px,
+            surface,
+        })
+    }
+
+    /// Where the target is, as of the last fix: pixel and surface, rover frame of that stop.
+    #[must_use]
+    pub fn target(&self) -> (&Vector2<f64>, &StereoPlane) {
+        (&self.pixel_px, &self.surface)
+    }
+
+    /// The anchor of the designation, carried along.
+    #[must_use]
+    pub fn first(&self) -> &Anchor {
+        &self.first
+    }
+
+    /// The rules.
+    #[must_use]
+    pub fn rules(&self) -> &TrackRules {
+        &self.rules
+    }
+
+    /// The newest anchor.
+    #[must_use]
+    pub fn newest(&self) -> &Anchor {
+        self.anchors.last().unwrap_or(&self.first)
+    }
+
+    /// Where the newest anchor's warp and `now_from_last` predict the target in a camera.
+    #[must_use]
+    pub fn predicted_pixel(
+        &self,
+        camera: &rover_cameras::Camera,
+        now_from_last: &Isometry3<f64>,
+    ) -> Option<Vector2<f64>> {
+        self.newest()
+            .warp
+            .moved(now_from_last)
+            .pixel(camera, &Vector2::zeros())
+    }
+
+    /// Finds the target in the view of the next stop. `now_from_last` is the rover's motion as
+    /// odometry and attitude sensor tell it, `prediction_px2` the covariance of the predicted
+    /// pixel. `last_stop` asks for the relief correction in any case. On a refusal nothing
+    /// changes, so that another image of the same stop may be tried.
+    ///
+    /// # Errors
+    /// [`Refusal`] with each attempt's reason.
+    pub fn update(
+        &mut self,
+        view: &Arc<View>,
+        now_from_last: &Isometry3<f64>,
+        prediction_px2: &Matrix2<f64>,
+        last_stop: bool,
+    ) -> Result<Fix, Refusal> {
+        let mut attempts = Vec::new();
+        let newest = self.anchors.len() - 1;
+        let mut plan = vec![
+            (Attempt::Affine, newest, Freedom::Affine),
+            (Attempt::Translation, newest, Freedom::Translation),
+        ];
+        if newest > 0 {
+            plan.push((Attempt::PreviousAnchor, newest - 1, Freedom::Affine));
+        }
+        for (attempt, index, freedom) in plan {
+            match self.attempt(view, now_from_last, prediction_px2, index, freedom) {
+                Ok(found) => {
+                    return Ok(self.accept(
+                        view,
+                        now_from_last,
+                        prediction_px2,
+                        (attempt, index, found),
+                        last_stop,
+                    ));
+                }
+                Err(error) => attempts.push((attempt, error)),
+            }
+        }
+        Err(Refusal { attempts })
+    }
+
+    fn attempt(
+        &self,
+        view: &View,
+        now_from_last: &Isometry3<f64>,
+        prediction_px2: &Matrix2<f64>,
+        index: usize,
+        freedom: Freedom,
+    ) -> Result<Candidate, TrackError> {
+        let rules = &self.rules;
+        let camera = &view.cameras.left;
+        let anchor = &self.anchors[index];
+        let predicted = anchor.warp.moved(now_from_last);
+        let footprint = predicted.jacobian(camera).ok_or(TrackError::NotVisible)?;
+        let reach = reach(&footprint, prediction_px2, rules.search_sigma)?;
+        let (found_px, score, second_score) =
+            search(&anchor.template, &view.left, camera, &predicted, reach)?;
+        if !(score >= rules.min_search_score) {
+            return Err(TrackError::LowScore {
+                score,
+                limit: rules.min_search_score,
+                columns: 2 * reach.u + 1,
+                rows: 2 * reach.v + 1,
+            });
+        }
+        let (warp, _) = predicted
+            .turned_to(camera, &found_px)
+            .ok_or(TrackError::NotVisible)?;
+        let (mut warp, mut aligned) = refine(
+            &anchor.template,
+            &view.left,
+            camera,
+            &warp,
+            Freedom::Translation,
+            &rules.align,
+        )?;
+        if freedom == Freedom::Affine {
+            (warp, aligned) = refine(
+                &anchor.template,
+                &view.left,
+                camera,
+                &warp,
+                Freedom::Affine,
+                &rules.align,
+            )?;
+        }
+        if !(aligned.score >= rules.min_score) {
+            return Err(TrackError::LowScore {
+                score: aligned.score,
+                limit: rules.min_score,
+                columns: 2 * reach.u + 1,
+                rows: 2 * reach.v + 1,
+            });
+        }
+        let pixel_px = warp
+            .pixel(camera, &Vector2::zeros())
+            .ok_or(TrackError::NotVisible)?;
+        let plane = self.plane_at(view, &pixel_px, &predicted, now_from_last)?;
+        let warp = warp
+            .onto(camera, &plane.plane)
+            .ok_or(TrackError::NotVisible)?;
+        let back_px = self.track_back(view, anchor, &pixel_px, &warp)?;
+        if !(back_px <= rules.max_back_px) {
+            return Err(TrackError::NotMutual {
+                distance_px: back_px,
+                limit_px: rules.max_back_px,
+            });
+        }
+        let spread = footprint * aligned.covariance_px2 * footprint.transpose();
+        Ok(Candidate {
+            warp,
+            pixel_px,
+            surface: plane,
+            score: aligned.score,
+            second_score,
+            back_px,
+            sigma_px: spread.diagonal().max().sqrt(),
+        })
+    }
+
+    /// Stereo at a pixel, with the last plane as prior of slant and range.
+    fn plane_at(
+        &self,
+        view: &View,
+        pixel_px: &Vector2<f64>,
+        predicted: &PlaneWarp,
+        now_from_last: &Isometry3<f64>,
+    ) -> Result<StereoPlane, TrackError> {
+        let centre = view.cameras.left.model.cahv()[0];
+        let point = predicted
+            .point(&Vector2::zeros())
+            .ok_or(TrackError::NotVisible)?;
+        let range = (point - centre).norm();
+        let fraction = self.rules.plane.range_fraction;
+        let limits = [range * (1.0 - fraction), range * (1.0 + fraction)];
+        let normal = now_from_last.rotation * self.surface.plane.normal;
+        measure_plane(view, pixel_px, limits, Some(&normal), &self.rules.plane)
+    }
+
+    /// Follows a template cut here back to the anchor image; returns how far from the anchor
+    /// pixel it ends, px.
+    fn track_back(
+        &self,
+        view: &View,
+        anchor: &Anchor,
+        pixel_px: &Vector2<f64>,
+        warp: &PlaneWarp,
+    ) -> Result<f64, TrackError> {
+        let camera = &view.cameras.left;
+        let template = Template::cut(&view.left, pixel_px, anchor.template.half)?;
+        let back = warp
+            .jacobian(camera)
+            .and_then(|j| j.try_inverse())
+            .ok_or(TrackError::NotVisible)?;
+        // pixels of this window in the anchor image, by the accepted warp
+        let grown = template.half.grown(1);
+        let aligned = template.align(Freedom::Translation, &self.rules.align, |shift, turn| {
+            crate::patch::Patch::by_map(&anchor.view.left, grown, &back, |d| {
+                let here = pixel_px + shift + turn * d;
+                Some(anchor.pixel_px + warp.offset(camera, &here)?)
+            })
+        })?;
+        Ok((back * aligned.shift).norm())
+    }
+
+    fn accept(
+        &mut self,
+        view: &Arc<View>,
+        now_from_last: &Isometry3<f64>,
+        prediction_px2: &Matrix2<f64>,
+        (attempt, index, found): (Attempt, usize, Candidate),
+        last_stop: bool,
+    ) -> Fix {
+        let camera = &view.cameras.left;
+        let predicted_px = self.predicted_pixel(camera, now_from_last);
+        let innovation_px =
+            predicted_px.map_or_else(Vector2::zeros, |predicted| found.pixel_px - predicted);
+        let innovation_sigma = prediction_px2
+            .try_inverse()
+            .map_or(0.0, |p| innovation_px.dot(&(p * innovation_px)).sqrt());
+        // what the match says about the motion: a turn about the camera
+        let predicted = self.anchors[index].warp.moved(now_from_last);
+        let turn = predicted
+            .turned_to(camera, &found.pixel_px)
+            .map_or_else(Isometry3::identity, |(_, turn)| turn);
+        let corrected = turn * now_from_last;
+        let carry = |anchor: &mut Anchor| {
+            anchor.anchor_from_rover *= corrected.inverse();
+            let moved = anchor.warp.moved(&corrected);
+            let placed = moved
+                .turned_to(camera, &found.pixel_px)
+                .and_then(|(warp, _)| warp.onto(camera, &found.surface.plane));
+            anchor.warp = placed.unwrap_or(moved);
+        };
+        carry(&mut self.first);
+        self.anchors.iter_mut().for_each(carry);
+        self.anchors[index].warp = found.warp;
+        self.pixel_px = found.pixel_px;
+        self.surface = found.surface;
+        let shrunk = self.anchors[index].range_m / found.surface.range_m >= self.rules.anchor_ratio;
+        let mut relief_px = Vector2::zeros();
+        let mut anchored = false;
+        if shrunk || last_stop {
+            if let Some(moved) = self.relieved(view, index) {
+                relief_px = moved.0 - self.pixel_px;
+                (self.pixel_px, self.surface) = moved;
+            }
+            if let Ok(new) = anchor(Arc::clone(view), self.pixel_px, &self.surface, &self.rules) {
+                anchored = true;
+                self.anchors.push(new);
+                if self.anchors.len() > 2 {
+                    self.anchors.remove(0);
+                }
+            }
+        }
+        Fix {
+            pixel_px: self.pixel_px,
+            surface: self.surface,
+            score: found.score,
+            second_score: found.second_score,
+            back_px: found.back_px,
+            innovation_px,
+            innovation_sigma,
+            sigma_px: found.sigma_px,
+            attempt,
+            anchored,
+            relief_px,
+        }
+    }
+
+    /// The hit after the relief correction against anchor `index`, with the surface there.
+    fn relieved(&self, view: &View, index: usize) -> Option<(Vector2<f64>, StereoPlane)> {
+        let rules = self.rules.relief.as_ref()?;
+        let anchor = &self.anchors[index];
+        let geometry = AnchorGeometry {
+            camera: &anchor.view.cameras.left,
+            anchor_from_rover: &anchor.anchor_from_rover,
+            warp: &anchor.warp,
+        };
+        let pixel = corrected_pixel(view, &self.pixel_px, &self.surface.plane, &geometry, rules)?;
+        let plane = self
+            .plane_at(view, &pixel, &anchor.warp, &Isometry3::identity())
+            .ok()?;
+        Some((pixel, plane))
+    }
+
+    /// Moves the target to a better pixel of the last view, with the surface measured there, and
+    /// anchors it anew.
+    ///
+    /// # Errors
+    /// [`TrackError`] if there is no plane or no window at that pixel; nothing changes then.
+    pub fn move_to(&mut self, view: &Arc<View>, pixel_px: Vector2<f64>) -> Result<(), TrackError> {
+        let warp = self.newest().warp;
+        let surface = self.plane_at(view, &pixel_px, &warp, &Isometry3::identity())?;
+        let new = anchor(Arc::clone(view), pixel_px, &surface, &self.rules)?;
+        self.anchors.push(new);
+        if self.anchors.len() > 2 {
+            self.anchors.remove(0);
+        }
+        (self.pixel_px, self.surface) = (pixel_px, surface);
+        Ok(())
+    }
+}
+
+/// Search reach in template px for a covariance in image px^2.
+fn reach(
+    footprint: &Matrix2<f64>,
+    prediction_px2: &Matrix2<f64>,
+    sigmas: f64,
+) -> Result<HalfSize, TrackError> {
+    /// Farther than this no template is searched.
+    const MAX_REACH: f64 = 160.0;
+    let inverse = footprint.try_inverse().ok_or(TrackError::NotVisible)?;
+    let spread = inverse * prediction_px2 * inverse.transpose();
+    let side = |k: usize| {
+        let sigma = spread[(k, k)].max(0.0).sqrt();
+        (sigmas * sigma + 2.0).ceil()
+    };
+    let (u, v) = (side(0), side(1));
+    if !(u.is_finite() && v.is_finite()) {
+        return Err(TrackError::BadInput {
+            what: "covariance of the prediction".into(),
+            found: format!("{prediction_px2}"),
+            expected: "finite numbers".into(),
+        });
+    }
+    Ok(HalfSize {
+        u: u.min(MAX_REACH) as usize,
+        v: v.min(MAX_REACH) as usize,
+    })
+}
+
+/// Anchors a target at a pixel of a view.
+fn anchor(
+    view: Arc<View>,
+    pixel_px: Vector2<f64>,
+    surface: &StereoPlane,
+    rules: &TrackRules,
+) -> Result<Anchor, TrackError> {
+    let camera = &view.cameras.left;
+    let half = window(camera.model.cahv()[0], &surface.plane, rules);
+    let template = Template::cut(&view.left, &pixel_px, half)?;
+    let warp = PlaneWarp::new(camera, &pixel_px, &surface.plane).ok_or(TrackError::NotVisible)?;
+    Ok(Anchor {
+        pixel_px,
+        range_m: surface.range_m,
+        template,
+        warp,
+        anchor_from_rover: Isometry3::identity(),
+        view,
+    })
+}
+
+/// The template's half sizes: flattened by the foreshortening.
+fn window(eye: &nalgebra::Vector3<f64>, plane: &SurfacePlane, rules: &TrackRules) -> HalfSize {
+    let sight = (eye - plane.point).normalize();
+    let cosine = plane.normal.dot(&sight).clamp(0.0, 1.0);
+    let v = (rules.half_px as f64 * cosine.sqrt()).round() as usize;
+    HalfSize {
+        u: rules.half_px,
+        v: v.max(rules.min_half_px),
+    }
+}

@@ -1,0 +1,53 @@
+//! One stereo frame as the algorithms see it: both images made ready, and their camera models.
+
+use crate::error::TrackError;
+use rover_cameras::StereoPair;
+use rover_vision::PreparedImage;
+
+/// A stereo frame taken at one stop.
+#[derive(Clone, Debug)]
+pub struct View {
+    /// Left image.
+    pub left: PreparedImage,
+    /// Right image.
+    pub right: PreparedImage,
+    /// Believed camera models, rover frame of this stop, m.
+    pub cameras: StereoPair,
+}
+
+impl View {
+    /// Puts a view together.
+    ///
+    /// # Errors
+    /// [`TrackError::BadView`] if a camera model is none or an image has another size than its
+    /// model.
+    pub fn new(
+        left: PreparedImage,
+        right: PreparedImage,
+        cameras: StereoPair,
+    ) -> Result<Self, TrackError> {
+        cameras
+            .validate()
+            .map_err(|e| TrackError::BadView(e.to_string()))?;
+        for (side, image, camera) in [
+            ("left", &left, &cameras.left),
+            ("right", &right, &cameras.right),
+        ] {
+            let (found, expected) = (
+                (image.width_px(), image.height_px()),
+                (camera.width_px, camera.height_px),
+            );
+            if found != expected {
+                return Err(TrackError::BadView(format!(
+                    "the {side} image has {} x {} px, its camera model {} x {} px",
+                    found.0, found.1, expected.0, expected.1
+                )));
+            }
+        }
+        Ok(Self {
+            left,
+            right,
+            cameras,
+        })
+    }
+}

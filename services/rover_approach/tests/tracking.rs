@@ -1,0 +1,241 @@
+//! Tracking and hand-over on a drawn plane, where the right answer is known exactly.
+#![allow(clippy::unwrap_used, clippy::expect_used)]
+
+use nalgebra::{Isometry3, Matrix2, Point3, UnitQuaternion, Vector2, Vector3};
+use rover_approach::error::TrackError;
+use rover_approach::handover::{HandoverRules, hand_over};
+use rover_approach::track::{TrackRules, Tracker};
+use rover_approach::view::View;
+use rover_approach::warp::{PlaneWarp, SurfacePlane};
+use rover_cameras::{Cahv, Camera, CameraModel, StereoPair};
+use rover_vision::{Image8, PreparedImage};
+use std::sync::Arc;
+
+/// Smooth noise on a lattice, -1 to 1.
+fn noise(x: f64, y: f64, seed: u64) -> f64 {
+    let (i, j) = (x.floor(), y.floor());
+    let at = |a: f64, b: f64| {
+        let mut h = (a as i64 as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15)
+            ^ (b as i64 as u64).wrapping_mul(0xC2B2_AE3D_27D4_EB4F)
+            ^ seed.wrapping_mul(0x1656_67B1_9E37_79F9);
+        h ^= h >> 31;
+        h = h.wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        h ^= h >> 29;
+        (h >> 11) as f64 / (1u64 << 52) as f64 - 1.0
+    };
+    let s = |t: f64| t * t * (3.0 - 2.0 * t);
+    let (u, v) = (s(x - i), s(y - j));
+    let top = at(i, j) * (1.0 - u) + at(i + 1.0, j) * u;
+    let bottom = at(i, j + 1.0) * (1.0 - u) + at(i + 1.0, j + 1.0) * u;
+    top * (1.0 - v) + bottom * v
+}
+
+/// Grey value of the ground z = 0 of the site, without detail finer than `footprint_m`.
+fn albedo(x: f64, y: f64, footprint_m: f64, seed: u64) -> f64 {
+    let mut wave = 0.4;
+    let mut sum = 120.0;
+    while wave > 1.6 * footprint_m && wave > 0.004 {
+        sum += 16.0 * noise(x / wave, y / wave, seed + (1.0 / wave) as u64);
+        wave *= 0.5;
+    }
+    sum
+}
+
+fn camera(c: Vector3<f64>, axis: Vector3<f64>, focal_px: f64, size: [u32; 2]) -> Camera {
+    let right = axis.cross(&Vector3::z()).normalize();
+    let centre = size.map(|n| (f64::from(n) - 1.0) / 2.0);
+    let model = CameraModel::Cahv(Cahv {
+        c,
+        a: axis,
+        h: right * focal_px + axis * centre[0],
+        v: axis.cross(&right) * focal_px + axis * centre[1],
+    });
+    Camera {
+        model,
+        width_px: size[0],
+        height_px: size[1],
+    }
+}
+
+fn pair(c: Vector3<f64>, aim: Vector3<f64>, focal_px: f64, baseline_m: f64) -> StereoPair {
+    let axis = (aim - c).normalize();
+    let side = axis.cross(&Vector3::z()).normalize() * (0.5 * baseline_m);
+    StereoPair {
+        left: camera(c - side, axis, focal_px, [360, 220]),
+        right: camera(c + side, axis, focal_px, [360, 220]),
+    }
+}
+
+fn draw(site_camera: &Camera, seed: u64) -> PreparedImage {
+    let (w, h) = (site_camera.width_px, site_camera.height_px);
+    let mut pixels = Vec::new();
+    for v in 0..h {
+        for u in 0..w {
+            let mut sum = 0.0;
+            for k in 0..4 {
+                let part = Vector2::new(
+                    0.25 * f64::from(k % 2) - 0.125,
+                    0.25 * f64::from(k / 2) - 0.125,
+                );
+                let pixel = Vector2::new(f64::from(u), f64::from(v)) + part * 2.0;
+                let ray = site_camera.ray(&pixel).unwrap();
+                let range = -ray.origin.z / ray.direction.z;
+                let p = ray.at(range);
+                let footprint = range / 1290.0 / -ray.direction.z;
+                sum += albedo(p.x, p.y, footprint, seed);
+            }
+            pixels.push((sum / 4.0).round().clamp(0.0, 255.0) as u8);
+        }
+    }
+    PreparedImage::new(&Image8::from_raw(w, h, pixels).unwrap()).unwrap()
+}
+
+fn view(cameras: &StereoPair, site_from_rover: &Isometry3<f64>, seed: u64) -> Arc<View> {
+    let there = cameras.transformed(site_from_rover);
+    let view = View::new(
+        draw(&there.left, seed),
+        draw(&there.right, seed),
+        cameras.clone(),
+    );
+    Arc::new(view.unwrap())
+}
+
+fn pose(x: f64, yaw: f64) -> Isometry3<f64> {
+    Isometry3::from_parts(
+        Vector3::new(x, 0.0, 0.0).into(),
+        UnitQuaternion::from_euler_angles(0.01, -0.02, yaw),
+    )
+}
+
+const TARGET: [f64; 3] = [4.0, 0.1, 0.0];
+const MAST: [f64; 3] = [0.0, 0.0, 1.2];
+
+fn mast(site_from_rover: &Isometry3<f64>) -> (StereoPair, Vector3<f64>) {
+    let target = (site_from_rover.inverse() * Point3::from(TARGET)).coords;
+    let aim = target + Vector3::new(0.01, -0.02, 0.0);
+    (pair(MAST.into(), aim, 1290.0, 0.2), target)
+}
+
+fn designated(seed: u64) -> (Tracker, Isometry3<f64>) {
+    let start = pose(0.0, 0.0);
+    let (cameras, target) = mast(&start);
+    let pixel = cameras.left.project(&target).unwrap();
+    let view = view(&cameras, &start, seed);
+    let tracker = Tracker::designate(view, pixel, [1.0, 10.0], TrackRules::default()).unwrap();
+    (tracker, start)
+}
+
+/// Three stops with odometry wrong by 3 % and a degree, then the body pair.
+#[test]
+fn a_target_is_tracked_to_subpixel_and_handed_over() {
+    let (mut tracker, mut last) = designated(1);
+    let error = Isometry3::from_parts(
+        Vector3::new(0.02, -0.006, 0.0).into(),
+        UnitQuaternion::from_euler_angles(0.001, -0.001, 0.012),
+    );
+    let mut end = None;
+    for (x, yaw) in [(0.7, 0.02), (1.4, -0.01), (2.1, 0.03), (2.9, 0.02)] {
+        let now = pose(x, yaw);
+        let (cameras, target) = mast(&now);
+        let view = view(&cameras, &now, 1);
+        let motion = error * now.inverse() * last;
+        let spread = Matrix2::from_diagonal(&Vector2::new(400.0, 200.0));
+        let fix = tracker.update(&view, &motion, &spread, x > 2.5).unwrap();
+        let truth = cameras.left.project(&target).unwrap();
+        let off = (fix.pixel_px - truth).norm();
+        assert!(off < 0.6, "{off} px at {x} m: {fix:?}");
+        let point = (fix.surface.plane.point - target).norm();
+        assert!(point < 0.03, "{point}");
+        last = now;
+        end = Some((view, target, now));
+    }
+    let (mast_view, target, now) = end.unwrap();
+    let aim = Vector3::new(target.x, target.y, 0.0);
+    let believed = pair(Vector3::new(0.1, 0.0, 0.6), aim, 602.0, 0.08);
+    let mount = Isometry3::from_parts(
+        Vector3::new(0.002, -0.002, 0.001).into(),
+        UnitQuaternion::from_euler_angles(0.002, 0.001, -0.002),
+    );
+    let body = view(&believed.transformed(&mount), &now, 1);
+    // the mount error is in the images, not in the models
+    let body = View::new(body.left.clone(), body.right.clone(), believed.clone()).unwrap();
+    let (pixel, surface) = tracker.target();
+    let found = hand_over(&mast_view, pixel, surface, &body, &HandoverRules::default()).unwrap();
+    let truth = believed.transformed(&mount).left.project(&target).unwrap();
+    let off = (found.pixel_px - truth).norm();
+    assert!(off < 0.7, "{off} px: {found:?}");
+    assert!((found.geometric_px - truth).norm() > 1.0);
+}
+
+#[test]
+fn another_surface_is_refused_with_every_attempts_reason() {
+    let (mut tracker, last) = designated(1);
+    let before = *tracker.target().0;
+    let now = pose(0.7, 0.0);
+    let (cameras, _) = mast(&now);
+    let view = view(&cameras, &now, 77);
+    let spread = Matrix2::from_diagonal(&Vector2::new(100.0, 50.0));
+    let refusal = tracker
+        .update(&view, &(now.inverse() * last), &spread, false)
+        .unwrap_err();
+    assert_eq!(refusal.attempts.len(), 2);
+    assert!(
+        refusal.attempts.iter().all(|(_, e)| matches!(
+            e,
+            TrackError::LowScore { .. }
+                | TrackError::Diverged { .. }
+                | TrackError::NotMutual { .. }
+        )),
+        "{refusal}"
+    );
+    assert_eq!(*tracker.target().0, before);
+}
+
+#[test]
+fn a_warp_carries_every_point_of_its_plane() {
+    let (cameras, target) = mast(&pose(0.0, 0.0));
+    let camera = &cameras.left;
+    let plane = SurfacePlane {
+        point: target,
+        normal: Vector3::new(-0.1, 0.05, 1.0).normalize(),
+    };
+    let pixel = camera.project(&target).unwrap();
+    let motion = Isometry3::from_parts(
+        Vector3::new(-0.8, 0.1, 0.02).into(),
+        UnitQuaternion::from_euler_angles(0.02, -0.01, 0.1),
+    );
+    let warp = PlaneWarp::new(camera, &pixel, &plane).unwrap();
+    let moved = warp.moved(&motion);
+    for (u, v) in [(0.0, 0.0), (12.0, -7.0), (-9.0, 10.0)] {
+        let d = Vector2::new(u, v);
+        let ray = camera.ray(&(pixel + d)).unwrap();
+        let n = plane.normal;
+        let range = n.dot(&(plane.point - ray.origin)) / n.dot(ray.direction.as_ref());
+        let expected = (motion * Point3::from(ray.at(range))).coords;
+        assert!((moved.point(&d).unwrap() - expected).norm() < 1e-10);
+        let seen = camera.project(&expected).unwrap();
+        assert!((moved.offset(camera, &seen).unwrap() - d).norm() < 1e-8);
+        let other = SurfacePlane {
+            point: motion.transform_point(&Point3::from(target)).coords,
+            normal: Vector3::new(0.2, 0.1, 1.0).normalize(),
+        };
+        let slid = moved.onto(camera, &other).unwrap();
+        assert!((slid.pixel(camera, &d).unwrap() - seen).norm() < 1e-8);
+        let height = other.normal.dot(&(slid.point(&d).unwrap() - other.point));
+        assert!(height.abs() < 1e-10);
+    }
+    let step = 1e-4;
+    let j = moved.jacobian(camera).unwrap();
+    for k in 0..2 {
+        let mut d = Vector2::zeros();
+        d[k] = step;
+        let a = moved.pixel(camera, &d).unwrap();
+        let b = moved.pixel(camera, &-d).unwrap();
+        assert!(((a - b) / (2.0 * step) - j.column(k)).norm() < 1e-6);
+    }
+    let behind = SurfacePlane {
+        point: Vector3::new(-1.0, 0.0, 0.0),
+        normal: Vector3::x(),
+    };
+    assert!(PlaneWarp::new(camera, &pixel, &behind).is_none());
+}
