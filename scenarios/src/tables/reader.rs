@@ -89,7 +89,8 @@ impl Table {
     fn advance(&mut self) -> Result<Option<u64>, TableError> {
         match self.rows.read_byte_record(&mut self.record) {
             Ok(false) => Ok(None),
-            Ok(true) => Ok(Some(self.record.position().map_or(0, |p| p.line()))),
+            // The reader stands behind the end of the record's line.
+            Ok(true) => Ok(Some(self.rows.position().line().saturating_sub(1))),
             Err(error) => Err(TableError::Read {
                 file: self.file.clone(),
                 line: self.rows.get_ref().line,
@@ -257,7 +258,7 @@ fn shortened(cell: &[u8]) -> String {
     short.escape_debug().to_string()
 }
 
-/// Passes bytes on and refuses what would make the reader gather without bound: a line longer than
+/// Passes bytes on with plain line ends, the last one included, and refuses what would make the reader gather without bound: a line longer than
 /// [`LONGEST_LINE`], and a quoted cell that does not end on its line.
 struct Lines<R> {
     inner: R,
@@ -279,26 +280,47 @@ impl<R> Lines<R> {
 
 impl<R: Read> Read for Lines<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let read = self.inner.read(buffer)?;
         let refused = |what: String| Err(io::Error::new(io::ErrorKind::InvalidData, what));
-        for &byte in &buffer[..read] {
-            match byte {
-                b'\n' | b'\r' => {
-                    if self.quoted {
-                        return refused("a quoted cell does not end on its line".into());
-                    }
-                    self.line += u64::from(byte == b'\n');
-                    self.length = 0;
+        if buffer.is_empty() {
+            return Ok(0);
+        }
+        let mut kept = 0;
+        while kept == 0 {
+            let read = self.inner.read(buffer)?;
+            if read == 0 {
+                // The last line may lack its end.
+                if self.length == 0 {
+                    return Ok(0);
                 }
-                byte => {
-                    self.quoted ^= byte == b'"';
-                    self.length += 1;
-                    if self.length > LONGEST_LINE {
-                        return refused(format!("the line is longer than {LONGEST_LINE} bytes"));
+                buffer[0] = b'\n';
+                self.length = 0;
+                return Ok(1);
+            }
+            for i in 0..read {
+                let byte = buffer[i];
+                match byte {
+                    b'\r' => continue,
+                    b'\n' => {
+                        if self.quoted {
+                            return refused("a quoted cell does not end on its line".into());
+                        }
+                        self.line += 1;
+                        self.length = 0;
+                    }
+                    _ => {
+                        self.quoted ^= byte == b'"';
+                        self.length += 1;
+                        if self.length > LONGEST_LINE {
+                            return refused(format!(
+                                "the line is longer than {LONGEST_LINE} bytes"
+                            ));
+                        }
                     }
                 }
+                buffer[kept] = byte;
+                kept += 1;
             }
         }
-        Ok(read)
+        Ok(kept)
     }
 }
