@@ -170,10 +170,8 @@ fn a_model_goes_through_every_format_and_comes_back() {
         );
         assert_eq!(out.status.code(), Some(0), "{to}: {}", text(&out.stderr));
         let report: serde_json::Value = serde_json::from_slice(&out.stdout).unwrap();
-        assert_eq!(
-            (&report["exact"], &report["to"]),
-            (&true.into(), &to.into())
-        );
+        assert_eq!(report["exact"], true);
+        assert_eq!(report["to"], to);
         let back = read_text(&done(at, &["convert", file, "-", "--to", "cahv"])).unwrap();
         let camera = back.camera().unwrap();
         let point = Vector3::new(0.3, -0.2, 1.0);
@@ -239,10 +237,8 @@ fn info_says_what_the_model_means() {
     let folder = folder(&[("haz.cahvore", HAZCAM)]);
     let out = done(folder.path(), &["info", "haz.cahvore", "--json", "-"]);
     let info: serde_json::Value = serde_json::from_str(&out).unwrap();
-    assert_eq!(
-        (&info["model"], &info["frame"]),
-        (&"CAHVORE".into(), &"rover".into())
-    );
+    assert_eq!(info["model"], "CAHVORE");
+    assert_eq!(info["frame"], "rover");
     assert!(
         (info["focal_px"][0].as_f64().unwrap() - 454.8).abs() < 0.1,
         "{info}"

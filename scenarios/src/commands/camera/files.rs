@@ -175,10 +175,8 @@ fn text(path: &Path) -> Result<(String, String), CommandError> {
 
 /// The format of a text, by the file's extension and, for YAML and standard input, by content.
 fn format_of(path: &Path, text: &str) -> Format {
-    match by_extension(path) {
-        Some(Format::Toml) => return Format::Toml,
-        Some(format) => return format,
-        None => {}
+    if let Some(format) = by_extension(path) {
+        return format;
     }
     if opencv::is_opencv(text) {
         return Format::Opencv;
