@@ -253,6 +253,21 @@ impl Vehicle {
         self.state_at(&self.world_from_rover(), step)
     }
 
+    /// How far the rover moves while its drives hold, m.
+    pub fn creep_m(&mut self, steps: u32) -> f64 {
+        let before = self.world_from_rover().translation.vector;
+        for _ in 0..steps {
+            self.physics.command(
+                &self.drive.steer_rad,
+                &[0.0; 4],
+                &mut self.drive.wheel_rad,
+                &[0.0; 6],
+            );
+            self.physics.step();
+        }
+        (self.world_from_rover().translation.vector - before).norm()
+    }
+
     pub fn progress(&self) -> f64 {
         self.drive.progress()
     }

@@ -251,6 +251,15 @@ impl World {
         })
     }
 
+    /// How far the rover, on its wheels with its drives holding, moves in so many control steps,
+    /// mm: it should not.
+    pub fn creep_mm(&mut self, steps: u32) -> f64 {
+        let Some(vehicle) = &mut self.vehicle else {
+            return 0.0;
+        };
+        vehicle.creep_m(steps) * 1e3
+    }
+
     /// The site frame: where the rover stood at the start, levelled.
     pub(crate) fn world_from_site(&self) -> Option<Isometry3<f64>> {
         self.vehicle.as_ref().map(|v| v.world_from_site())
