@@ -81,6 +81,8 @@ pub enum BoardError {
 
 /// Largest number of corners on a side.
 pub const MAX_SIDE: usize = 64;
+/// Smoothing of the picture in which corners are refined, px.
+const FINE_BLUR_PX: f64 = 1.0;
 /// Halvings of the picture that are searched.
 const LEVELS: usize = 4;
 
@@ -111,7 +113,8 @@ pub fn find_chessboard(image: &Image8, board: Chessboard) -> Result<Vec<BoardCor
         candidates: 0,
     };
     let mut most = 0;
-    let fine = SplineImage::new(&full);
+    // A little smoothing: edges sharper than the pixel grid shows would pull the corners about.
+    let fine = SplineImage::new(&full.blurred(FINE_BLUR_PX));
     for (level, picture) in full.pyramid(LEVELS).into_iter().enumerate() {
         let smooth = picture.blurred(1.0);
         let points = candidates::saddles(&smooth, 8 * board.columns * board.rows + 400);
