@@ -15,6 +15,7 @@
 
 mod blobs;
 mod disc;
+mod edges;
 mod homography;
 mod pixels;
 mod plate;
@@ -24,13 +25,15 @@ mod tags;
 mod template;
 #[cfg(test)]
 mod tests;
+mod warp;
 
 pub use disc::{DiscRules, DiscTruth, Polarity, disc};
 pub use plate::plate;
 pub use saddle::{SaddleRules, saddle};
 pub use tag_code::TAG_FAMILIES;
 pub use tags::{TagRules, tags};
-pub use template::{Appearance, TemplateRules, template, warped_template};
+pub use template::{TemplateRules, template, warped_template};
+pub use warp::Appearance;
 
 use nalgebra::{Isometry3, Matrix6};
 use serde::Serialize;

@@ -8,6 +8,7 @@
 
 mod coarse;
 mod dense;
+mod dense_regions;
 mod link;
 mod matching;
 mod plane_smoothing;

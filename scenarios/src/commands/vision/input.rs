@@ -90,7 +90,7 @@ pub fn pair(
 /// Comma-separated finite numbers, for an argument.
 pub fn numbers<const N: usize>(found: &str) -> Result<[f64; N], String> {
     let refuse = || format!("`{found}` is given, {N} finite numbers with commas are expected");
-    let mut all = [0.0_f64; N];
+    let mut all = [0.0f64; N];
     let mut parts = found.split(',');
     for x in &mut all {
         let part = parts.next().ok_or_else(refuse)?;

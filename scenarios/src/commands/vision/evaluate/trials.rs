@@ -1,12 +1,14 @@
 //! What is evaluated: for every detector and matcher a trial with known truth, and a patch without
 //! the fiducial.
 
+mod plate;
 mod stereo;
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector2, Vector3};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rover_cameras::Camera;
+use rover_vision::Image8;
 use rover_vision::find::{
     self, Appearance, DiscRules, DiscTruth, Finding, NoFinding, SaddleRules, TagRules,
     TemplateRules,
@@ -14,7 +16,6 @@ use rover_vision::find::{
 use rover_vision::harris::HarrisRules;
 use rover_vision::ncc::Window;
 use rover_vision::texture::texture;
-use rover_vision::{DetectionRules, Image8, PlateLayout, PlateSearch, find_plate, find_saddle};
 
 use super::patch::{self, FOCAL_PX, Light};
 
@@ -101,15 +102,15 @@ pub const SUBJECTS: [Subject; 11] = [
     },
     Subject {
         name: "plate",
-        trial: plate,
-        blank: Some(blank_plate),
+        trial: plate::plate,
+        blank: Some(plate::blank_plate),
         target: FIDUCIAL,
         coordinates: 2,
     },
     Subject {
         name: "plate's saddle",
-        trial: plate_saddle,
-        blank: Some(blank_plate_saddle),
+        trial: plate::plate_saddle,
+        blank: Some(plate::blank_plate_saddle),
         target: FIDUCIAL,
         coordinates: 2,
     },
@@ -376,100 +377,6 @@ fn saddle(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
 fn blank_saddle(rng: &mut ChaCha8Rng, noise_dn: f64) -> bool {
     patch::blank(SIDE_PX, SIDE_PX, noise_dn, rng).is_some_and(|image| {
         find::saddle(&image, Window::whole(&image), &SaddleRules::default()).is_ok()
-    })
-}
-
-/// Side of the patches that hold a whole plate, px, and how far it is searched, px.
-const PLATE_SIDE_PX: u32 = 200;
-const PLATE_RADIUS_PX: f64 = 20.0;
-const PLATE_M: f64 = 0.08;
-
-fn plate_scene(
-    rng: &mut ChaCha8Rng,
-    noise_dn: f64,
-) -> Option<(Camera, Image8, Isometry3<f64>, Vector2<f64>)> {
-    let layout = PlateLayout::standard(PLATE_M);
-    let shade = move |x: f64, y: f64| layout.albedo(x, y).map(|a| a * WHITE_DN / 0.85);
-    scene(rng, noise_dn, PLATE_SIDE_PX, std::f64::consts::PI, &shade)
-}
-
-/// Error of one point of the plate, a different one in every trial.
-fn plate(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
-    let Some((camera, image, pose, _)) = plate_scene(rng, noise_dn) else {
-        return Outcome::MISSED;
-    };
-    let search = PlateSearch {
-        camera: &camera,
-        layout: &PlateLayout::standard(PLATE_M),
-        predicted_camera_frame_from_plate: spoiled(&pose, rng),
-        search_radius_px: PLATE_RADIUS_PX,
-        rules: &DetectionRules::default(),
-    };
-    let Ok(found) = find_plate(&image, &search) else {
-        return Outcome::MISSED;
-    };
-    let chosen = rng.random_range(0..found.points.len().max(1));
-    found
-        .points
-        .get(chosen)
-        .and_then(|p| {
-            let truth = patch::seen(&camera, &pose, p.point_in_plate.x, p.point_in_plate.y)?;
-            let off = p.pixel_px - truth;
-            Some(Outcome {
-                error_px: Some([off.x, off.y]),
-                sigma_px: p.sigma_px,
-            })
-        })
-        .unwrap_or(Outcome::MISSED)
-}
-
-/// A patch without a plate, and where one is said to be.
-fn blank_scene(rng: &mut ChaCha8Rng, noise_dn: f64) -> Option<(Camera, Isometry3<f64>, Image8)> {
-    let camera = patch::camera(PLATE_SIDE_PX, PLATE_SIDE_PX, Vector3::zeros(), 0.0);
-    let pose = patch::pose(rng, MAX_TILT_RAD, std::f64::consts::PI);
-    let image = patch::blank(PLATE_SIDE_PX, PLATE_SIDE_PX, noise_dn, rng)?;
-    Some((camera, pose, image))
-}
-
-fn blank_plate(rng: &mut ChaCha8Rng, noise_dn: f64) -> bool {
-    blank_scene(rng, noise_dn).is_some_and(|(camera, pose, image)| {
-        let (layout, rules) = (PlateLayout::standard(PLATE_M), DetectionRules::default());
-        let near = Some((&pose, PLATE_RADIUS_PX));
-        find::plate(&image, &camera, &layout, near, &rules).is_ok()
-            || find::plate(&image, &camera, &layout, None, &rules).is_ok()
-    })
-}
-
-fn plate_saddle(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
-    let Some((camera, image, pose, truth)) = plate_scene(rng, noise_dn) else {
-        return Outcome::MISSED;
-    };
-    let search = PlateSearch {
-        camera: &camera,
-        layout: &PlateLayout::standard(PLATE_M),
-        predicted_camera_frame_from_plate: spoiled(&pose, rng),
-        search_radius_px: PLATE_RADIUS_PX,
-        rules: &DetectionRules::default(),
-    };
-    find_saddle(&image, &search).map_or(Outcome::MISSED, |p| {
-        let off = p.pixel_px - truth;
-        Outcome {
-            error_px: Some([off.x, off.y]),
-            sigma_px: p.sigma_px,
-        }
-    })
-}
-
-fn blank_plate_saddle(rng: &mut ChaCha8Rng, noise_dn: f64) -> bool {
-    blank_scene(rng, noise_dn).is_some_and(|(camera, pose, image)| {
-        let search = PlateSearch {
-            camera: &camera,
-            layout: &PlateLayout::standard(PLATE_M),
-            predicted_camera_frame_from_plate: pose,
-            search_radius_px: PLATE_RADIUS_PX,
-            rules: &DetectionRules::default(),
-        };
-        find_saddle(&image, &search).is_ok()
     })
 }
 
