@@ -152,7 +152,11 @@ impl Plot {
             let _ = write!(
                 out,
                 "<polyline points=\"{}\" fill=\"none\" stroke=\"{}\" stroke-width=\"2\"/>",
-                if line { points.join(" ") } else { String::new() },
+                if line {
+                    points.join(" ")
+                } else {
+                    String::new()
+                },
                 s.colour
             );
             let dots = s.marks != Marks::Line;

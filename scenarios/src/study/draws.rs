@@ -14,9 +14,11 @@ fn mixed(x: u64) -> u64 {
 
 /// The key of a stream of draws: a seed and the places in the study that the stream belongs to.
 pub fn key(seed: u64, places: &[u64]) -> u64 {
-    places.iter().fold(mixed(seed.wrapping_add(GOLDEN)), |k, p| {
-        mixed(k.wrapping_add(GOLDEN) ^ mixed(p.wrapping_mul(GOLDEN)))
-    })
+    places
+        .iter()
+        .fold(mixed(seed.wrapping_add(GOLDEN)), |k, p| {
+            mixed(k.wrapping_add(GOLDEN) ^ mixed(p.wrapping_mul(GOLDEN)))
+        })
 }
 
 /// A uniform number in `(0, 1)` of 24 bits from the key and a counter.

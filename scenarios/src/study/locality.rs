@@ -460,7 +460,11 @@ mod tests {
                 let (vector, field) = (r.slope_mm_per_m, r.field_slope_mm_per_m);
                 assert!((22.0..42.0).contains(&vector), "{}: {vector}", r.name);
                 assert!(r.r2 > 0.85, "{}: {}", r.name, r.r2);
-                assert!((4.5..8.0).contains(&r.error_at_16cm_mm), "{}", r.error_at_16cm_mm);
+                assert!(
+                    (4.5..8.0).contains(&r.error_at_16cm_mm),
+                    "{}",
+                    r.error_at_16cm_mm
+                );
                 assert!(field < 0.25 * vector, "{}: {field}", r.name);
             }
         }

@@ -38,17 +38,9 @@ impl Line {
             points.iter().map(|p| p.0).sum::<f64>() / n,
             points.iter().map(|p| p.1).sum::<f64>() / n,
         );
-        let sum = |f: &dyn Fn(f64, f64) -> f64| {
-            points
-                .iter()
-                .map(|p| f(p.0 - mx, p.1 - my))
-                .sum::<f64>()
-        };
-        let (xx, xy, yy) = (
-            sum(&|x, _| x * x),
-            sum(&|x, y| x * y),
-            sum(&|_, y| y * y),
-        );
+        let sum =
+            |f: &dyn Fn(f64, f64) -> f64| points.iter().map(|p| f(p.0 - mx, p.1 - my)).sum::<f64>();
+        let (xx, xy, yy) = (sum(&|x, _| x * x), sum(&|x, y| x * y), sum(&|_, y| y * y));
         if points.len() < 3 || xx.is_nan() || xx <= 0.0 {
             return None;
         }
@@ -83,7 +75,9 @@ mod tests {
 
     #[test]
     fn a_line_is_found_again() {
-        let points: Vec<_> = (0..9).map(|i| (f64::from(i), 2.0 + 0.5 * f64::from(i))).collect();
+        let points: Vec<_> = (0..9)
+            .map(|i| (f64::from(i), 2.0 + 0.5 * f64::from(i)))
+            .collect();
         let line = Line::fit(&points).unwrap();
         assert!((line.slope - 0.5).abs() < 1e-12 && (line.intercept - 2.0).abs() < 1e-12);
         assert!((line.r2 - 1.0).abs() < 1e-12 && (line.at(4.0) - 4.0).abs() < 1e-12);

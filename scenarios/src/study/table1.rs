@@ -198,7 +198,10 @@ mod tests {
             let table = table1(&StudyConfig::new(seed, 40, None)).unwrap();
             for r in &table.rows {
                 assert_eq!((r.targets, r.failed), (196, 0));
-                assert!((r.before_mm / r.paper_before_mm - 1.0).abs() < 0.25, "{r:?}");
+                assert!(
+                    (r.before_mm / r.paper_before_mm - 1.0).abs() < 0.25,
+                    "{r:?}"
+                );
                 assert!(r.after_mm < 1.4 * r.paper_after_mm, "{r:?}");
                 assert!(r.after_two_mm < 0.1, "{r:?}");
                 assert!(r.after_three_mm < r.after_two_mm, "{r:?}");
@@ -219,14 +222,24 @@ mod tests {
             for trial in [0, 5, 69] {
                 let e = draw(stream, trial);
                 let scaled: Vec<f64> = (0..20)
-                    .map(|k| e[k] * if k % 4 == 0 || k % 4 == 3 { angle } else { length })
+                    .map(|k| {
+                        e[k] * if k % 4 == 0 || k % 4 == 3 {
+                            angle
+                        } else {
+                            length
+                        }
+                    })
                     .collect();
                 let real = arm.perturbed(&scaled).unwrap();
-                let turn = UnitQuaternion::from_scaled_axis(Vector3::new(e[20], e[21], e[22]) * angle);
+                let turn =
+                    UnitQuaternion::from_scaled_axis(Vector3::new(e[20], e[21], e[22]) * angle);
                 let shift = Vector3::new(e[23], e[24], e[25]) * length;
                 let mut command = goal.point;
                 for stage in &batch.errors_m {
-                    let at = AxisGoal { point: command, axis: goal.axis };
+                    let at = AxisGoal {
+                        point: command,
+                        axis: goal.axis,
+                    };
                     let q = closest_solution(&arm, &tool, &at, &q0).unwrap();
                     let p = real.point(&q, &tool.tip_in_link).unwrap();
                     let miss = turn * (p - c0) + c0 + shift - goal.point;
@@ -240,7 +253,11 @@ mod tests {
 
     #[test]
     fn threads_do_not_change_a_bit() {
-        let of = |threads| table1(&StudyConfig::new(5, 12, Some(threads))).unwrap().rows;
+        let of = |threads| {
+            table1(&StudyConfig::new(5, 12, Some(threads)))
+                .unwrap()
+                .rows
+        };
         assert_eq!(of(1), of(3));
     }
 }

@@ -71,10 +71,7 @@ impl TrueRobot {
         let turn = UnitQuaternion::from_scaled_axis(rotation);
         Ok(Self {
             arm: believed.arm.perturbed(errors)?,
-            believed_from_true: Translation3::from(translation)
-                * centre
-                * turn
-                * centre.inverse(),
+            believed_from_true: Translation3::from(translation) * centre * turn * centre.inverse(),
         })
     }
 
