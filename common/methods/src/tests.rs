@@ -118,10 +118,11 @@ fn placed(kind: Kind, setup: &Arc<Setup>, robot: &Robot, heights: &[f64]) -> f64
     let mut q = vec![0.0, -1.0, 1.8, 0.8, 1.5];
     for i in 0..kind.initial_poses() {
         let i = i as f64;
+        // Spread in all three directions: a linear camera needs points that lie in no plane.
         let at = Vector3::new(
-            0.40 + 0.02 * (i % 6.0),
+            0.40 + 0.03 * (5.0 * i % 7.0),
             -0.2 + 0.035 * i,
-            0.11 - 0.05 * (i % 4.0),
+            0.11 - 0.05 * (i * i % 5.0),
         );
         let axis = Unit::new_normalize(Vector3::new(0.2 * (i * 1.7).sin(), 0.2 * i.cos(), 1.0));
         q = setup.joints(&at, &axis, &q).unwrap();
