@@ -2,7 +2,8 @@
 //! where the target is (Skaar, Brockman and Hanson 1987), and its linear variant.
 
 use crate::{
-    Method, MethodError, Reference, Sample, Setup, hips::STRAIN_PX_M,
+    Method, MethodError, Reference, Sample, Setup,
+    hips::STRAIN_PX_M,
     linear::{least_squares, solve_scaled},
     setup::finite,
 };
@@ -224,9 +225,8 @@ impl Method for CameraSpace {
         };
         self.sightings.push(sighting);
         let level = self.setup.level_deg();
-        let weights = Vector6::from_fn(|i, _| {
-            1.0 / (if i < 4 { PRIOR_C } else { PRIOR_PX } * level).powi(2)
-        });
+        let weights =
+            Vector6::from_fn(|i, _| 1.0 / (if i < 4 { PRIOR_C } else { PRIOR_PX } * level).powi(2));
         let mut origin = self.estimate;
         let mut fitted_at = origin;
         for _ in 0..STEPS {
@@ -256,6 +256,10 @@ impl Method for CameraSpace {
             None => finite(reference.tip_in_rover),
             Some(views) => finite(self.origin + self.solve(views, &reference.tip_in_rover)?),
         }
+    }
+
+    fn duplicate(&self) -> Box<dyn Method> {
+        Box::new(self.clone())
     }
 
     fn state_bytes(&self) -> usize {
@@ -377,6 +381,10 @@ impl Method for LinearCameraSpace {
             None => finite(reference.tip_in_rover),
             Some(fitted) => fitted.triangulate(&self.pixels(&reference.tip_in_rover)?),
         }
+    }
+
+    fn duplicate(&self) -> Box<dyn Method> {
+        Box::new(self.clone())
     }
 
     fn state_bytes(&self) -> usize {

@@ -1,9 +1,6 @@
 //! Kinematics alone, and the paper's rule.
 
-use crate::{
-    Method, MethodError, Reference, Sample, Setup,
-    setup::finite,
-};
+use crate::{Method, MethodError, Reference, Sample, Setup, setup::finite};
 use nalgebra::Vector3;
 use std::sync::Arc;
 
@@ -18,6 +15,10 @@ impl Method for Kinematic {
 
     fn command(&self, reference: &Reference, _near: &[f64]) -> Result<Vector3<f64>, MethodError> {
         finite(reference.tip_in_rover)
+    }
+
+    fn duplicate(&self) -> Box<dyn Method> {
+        Box::new(self.clone())
     }
 
     fn state_bytes(&self) -> usize {
@@ -58,6 +59,10 @@ impl Method for Epec {
 
     fn command(&self, reference: &Reference, _near: &[f64]) -> Result<Vector3<f64>, MethodError> {
         finite(reference.tip_in_rover - self.vector_m)
+    }
+
+    fn duplicate(&self) -> Box<dyn Method> {
+        Box::new(self.clone())
     }
 
     fn state_bytes(&self) -> usize {

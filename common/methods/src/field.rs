@@ -2,9 +2,7 @@
 //! the stated quality of arm and mount.
 
 use crate::{
-    Method, MethodError, Reference, Sample, Setup,
-    linear::solve_scaled_dynamic,
-    setup::finite,
+    Method, MethodError, Reference, Sample, Setup, linear::solve_scaled_dynamic, setup::finite,
 };
 use nalgebra::{DMatrix, DVector, Matrix3xX, Vector3};
 use std::sync::Arc;
@@ -125,6 +123,10 @@ impl Method for Field {
             command = at - self.vector_at(&q)?;
         }
         finite(command)
+    }
+
+    fn duplicate(&self) -> Box<dyn Method> {
+        Box::new(self.clone())
     }
 
     fn state_bytes(&self) -> usize {

@@ -68,10 +68,9 @@ impl Adjustment {
     /// The camera with this adjustment.
     fn apply(&self, camera: &Camera) -> Camera {
         let c = *camera.model.cahv()[0];
-        let adjusted_from_believed = Isometry3::from_parts(
-            Translation3::from(c + self.shift),
-            self.rotation.inverse(),
-        ) * Translation3::from(-c);
+        let adjusted_from_believed =
+            Isometry3::from_parts(Translation3::from(c + self.shift), self.rotation.inverse())
+                * Translation3::from(-c);
         camera.transformed(&adjusted_from_believed)
     }
 
@@ -90,23 +89,16 @@ impl Adjustment {
             1.0 / (sigma * level_deg).powi(2)
         });
         let w = self.rotation.scaled_axis();
-        let now = Vector6::new(
-            self.shift.x,
-            self.shift.y,
-            self.shift.z,
-            w.x,
-            w.y,
-            w.z,
-        );
+        let now = Vector6::new(self.shift.x, self.shift.y, self.shift.z, w.x, w.y, w.z);
         let mut normal = Matrix6::from_diagonal(&weights);
         let mut gradient = -weights.component_mul(&now);
         for (sighting, sigma) in sightings.iter().zip(sigma_px) {
             let from_centre = self.rotation * (sighting.predicted - c - self.shift);
             let projection = camera.project_with_jacobian(&(from_centre + c))?;
             let mut jacobian = Matrix2x6::zeros();
-            jacobian.fixed_view_mut::<2, 3>(0, 0).copy_from(
-                &(-projection.jacobian * self.rotation.to_rotation_matrix().matrix()),
-            );
+            jacobian
+                .fixed_view_mut::<2, 3>(0, 0)
+                .copy_from(&(-projection.jacobian * self.rotation.to_rotation_matrix().matrix()));
             jacobian
                 .fixed_view_mut::<2, 3>(0, 3)
                 .copy_from(&(-projection.jacobian * from_centre.cross_matrix()));
@@ -161,14 +153,9 @@ impl Hips {
         let own = self.setup.sigma_px();
         let far = |s: &Sighting| match self.samples {
             Samples::Initial => LIMITED_PX,
-            Samples::All => {
-                STRAIN_PX_M * self.setup.level_deg() * (s.predicted - target).norm()
-            }
+            Samples::All => STRAIN_PX_M * self.setup.level_deg() * (s.predicted - target).norm(),
         };
-        self.sightings
-            .iter()
-            .map(|s| own.hypot(far(s)))
-            .collect()
+        self.sightings.iter().map(|s| own.hypot(far(s))).collect()
     }
 }
 
@@ -198,8 +185,11 @@ impl Method for Hips {
         self.in_arm(&self.adjusted, &reference.tip_in_rover)
     }
 
+    fn duplicate(&self) -> Box<dyn Method> {
+        Box::new(self.clone())
+    }
+
     fn state_bytes(&self) -> usize {
         size_of_val(self.sightings.as_slice()) + size_of_val(&self.adjusted)
     }
 }
-

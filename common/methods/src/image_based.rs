@@ -1,10 +1,7 @@
 //! Image-based visual servoing with a fixed stereo pair: the error is one of pixels, and the
 //! stacked image Jacobian turns it into a move.
 
-use crate::{
-    Method, MethodError, Reference, Sample, Setup,
-    setup::finite,
-};
+use crate::{Method, MethodError, Reference, Sample, Setup, setup::finite};
 use nalgebra::{Matrix4x3, Vector3, Vector4};
 use std::sync::Arc;
 
@@ -102,6 +99,10 @@ impl Method for ImageBased {
 
     fn command(&self, reference: &Reference, _near: &[f64]) -> Result<Vector3<f64>, MethodError> {
         finite(reference.tip_in_rover + self.offset_m)
+    }
+
+    fn duplicate(&self) -> Box<dyn Method> {
+        Box::new(self.clone())
     }
 
     fn state_bytes(&self) -> usize {

@@ -152,6 +152,10 @@ impl Method for KinematicCalibration {
         finite(command)
     }
 
+    fn duplicate(&self) -> Box<dyn Method> {
+        Box::new(self.clone())
+    }
+
     fn state_bytes(&self) -> usize {
         let joints = self.setup.model.arm.joint_count();
         self.sightings.len() * 8 * (joints + 4) + 8 * (self.fitted.rows.len() + 7)

@@ -27,6 +27,8 @@ mod linear;
 pub mod mount_calibration;
 pub mod position_based;
 mod setup;
+#[cfg(test)]
+mod tests;
 
 pub use setup::{MethodError, Reference, Sample, Setup};
 
@@ -48,6 +50,9 @@ pub trait Method: Debug + Send {
     /// # Errors
     /// [`MethodError`] when the method has no answer there.
     fn command(&self, reference: &Reference, near: &[f64]) -> Result<Vector3<f64>, MethodError>;
+
+    /// A copy with all that was learnt.
+    fn duplicate(&self) -> Box<dyn Method>;
 
     /// Bytes that the method keeps from one cycle to the next.
     fn state_bytes(&self) -> usize;

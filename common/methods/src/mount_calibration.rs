@@ -1,10 +1,6 @@
 //! The camera mount from point correspondences, fiducial predicted against fiducial seen.
 
-use crate::{
-    Method, MethodError, Reference, Sample, Setup,
-    linear::solve_scaled,
-    setup::finite,
-};
+use crate::{Method, MethodError, Reference, Sample, Setup, linear::solve_scaled, setup::finite};
 use nalgebra::{Matrix3, Matrix3x6, Matrix6, Rotation3, Vector3, Vector6};
 use std::sync::Arc;
 
@@ -78,6 +74,10 @@ impl Method for Kabsch {
 
     fn command(&self, reference: &Reference, _near: &[f64]) -> Result<Vector3<f64>, MethodError> {
         finite(self.rotation.inverse() * (reference.tip_in_rover - self.translation))
+    }
+
+    fn duplicate(&self) -> Box<dyn Method> {
+        Box::new(self.clone())
     }
 
     fn state_bytes(&self) -> usize {
@@ -174,6 +174,10 @@ impl Method for MountMap {
 
     fn command(&self, reference: &Reference, _near: &[f64]) -> Result<Vector3<f64>, MethodError> {
         finite(self.in_arm(&reference.tip_in_rover))
+    }
+
+    fn duplicate(&self) -> Box<dyn Method> {
+        Box::new(self.clone())
     }
 
     fn state_bytes(&self) -> usize {

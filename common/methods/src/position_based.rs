@@ -1,10 +1,7 @@
 //! Position-based visual servoing with a fixed stereo pair (literature: Hager 1997; Hutchinson,
 //! Hager and Corke 1996). With gain 1 and one move per image it is the paper's rule.
 
-use crate::{
-    Method, MethodError, Reference, Sample, Setup,
-    setup::finite,
-};
+use crate::{Method, MethodError, Reference, Sample, Setup, setup::finite};
 use nalgebra::Vector3;
 use std::sync::Arc;
 
@@ -44,6 +41,10 @@ impl Method for PositionBased {
 
     fn command(&self, reference: &Reference, _near: &[f64]) -> Result<Vector3<f64>, MethodError> {
         finite(reference.tip_in_rover + self.offset_m)
+    }
+
+    fn duplicate(&self) -> Box<dyn Method> {
+        Box::new(self.clone())
     }
 
     fn state_bytes(&self) -> usize {

@@ -16,6 +16,8 @@ pub enum Which {
     Locality,
     /// Every method that the paper names, under the same truths and noise
     Compare,
+    /// Time and memory of a cycle of each method
+    Cost,
     /// All of them in one report
     All,
 }
@@ -109,6 +111,9 @@ fn study(args: &StudyArgs) -> Result<StudyReport, StudyError> {
             &study::compare::Case::ALL,
             &study::compare::OCCLUSIONS_CM,
         )?);
+    }
+    if all || args.which == Which::Cost {
+        report.cost = Some(study::cost::cost(&config(study::cost::TRIALS))?);
     }
     Ok(report)
 }

@@ -8,10 +8,12 @@
 //! |---|---|
 //! | [`table1`] | how much does one vector correct at the target, and a second one |
 //! | [`locality`] | how far from the target may the vector be taken |
-//! | [`compare`] | what do the other methods achieve, and at what cost |
+//! | [`compare`] | what do the other methods achieve |
+//! | [`cost`] | what does a cycle cost in time and memory |
 
 pub mod batch;
 pub mod compare;
+pub mod cost;
 pub mod draws;
 pub mod locality;
 pub mod report;

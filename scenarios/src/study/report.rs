@@ -2,6 +2,7 @@
 
 use super::{
     compare::{Case, Cell, Comparison, OCCLUSIONS_CM},
+    cost::Cost,
     locality::{Locality, Reference},
     table1::Table1,
 };
@@ -39,6 +40,9 @@ pub struct StudyReport {
     /// The methods against each other.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub compare: Option<Comparison>,
+    /// What a cycle costs.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cost: Option<Cost>,
 }
 
 impl StudyReport {
@@ -119,6 +123,17 @@ impl StudyReport {
         if let Some(comparison) = &self.compare {
             out += &compare_lines(comparison);
         }
+        if let Some(cost) = &self.cost {
+            out += "cost\n  us a cycle with so many sightings\n";
+            for m in &cost.methods {
+                let _ = write!(out, "  {:<24}", m.name);
+                for c in &m.cycles {
+                    let _ = write!(out, " {:>3}: {:>8.1}", c.sightings, c.cycle_us);
+                }
+                out += "\n";
+            }
+            let _ = writeln!(out, "  {}", cost.verdict());
+        }
         out
     }
 
@@ -153,6 +168,9 @@ impl StudyReport {
                 "The methods against each other",
                 compare_section(comparison),
             );
+        }
+        if let Some(cost) = &self.cost {
+            add("cost", "What a cycle costs", cost_section(cost));
         }
         add(
             "unknown",
@@ -460,4 +478,34 @@ fn compare_section(comparison: &Comparison) -> String {
         );
     }
     out
+}
+
+fn cost_section(cost: &Cost) -> String {
+    let mut rows = String::new();
+    let mut head = String::new();
+    for (i, m) in cost.methods.iter().enumerate() {
+        let _ = write!(rows, "<tr><td class=\"text\">{}</td>", m.name);
+        for c in &m.cycles {
+            if i == 0 {
+                let _ = write!(head, "<th>{}: us</th><th>flight, ms</th>", c.sightings);
+            }
+            let _ = write!(
+                rows,
+                "<td>{:.2}</td><td>{:.3}</td>",
+                c.cycle_us, c.flight_ms
+            );
+        }
+        let bytes = m.cycles.last().map_or(0, |c| c.state_bytes);
+        let _ = write!(rows, "<td>{bytes}</td></tr>");
+    }
+    format!(
+        "{}<p>Time of one cycle on this machine with so many sightings, and on a 200 MHz \
+         radiation-hardened processor that is assumed to be {:.0} times slower: 15 by its clock, 4 \
+         because it does at best one floating-point operation per cycle, without vector unit and \
+         with small caches. The factor is an assumption, not a measurement.</p>\
+         <div class=\"scroll\"><table><tr><th class=\"text\">method</th>{head}<th>bytes kept</th></tr>\
+         {rows}</table></div>",
+        verdict(&cost.verdict()),
+        cost.flight_factor
+    )
 }
