@@ -43,14 +43,16 @@ pub const ROBOTS: &[ShippedFile] = &[
 /// Name of the scenario that runs when none is named.
 pub const DEFAULT_SCENARIO: &str = "scenarios/bluestreak.toml";
 
-/// The shipped file of that name, with or without the leading `scenarios/`.
+/// The shipped file of that name, with or without its folder.
 pub fn find(files: &'static [ShippedFile], name: &str) -> Option<ShippedFile> {
     let name = name.strip_prefix("./").unwrap_or(name);
-    let full = format!("scenarios/{name}");
-    files
-        .iter()
-        .find(|(shipped, _)| *shipped == name || *shipped == full)
-        .copied()
+    let within = |shipped: &str| {
+        shipped
+            .strip_suffix(name)
+            .is_some_and(|folder| folder.is_empty() || folder.ends_with('/'))
+    };
+    let found = |(shipped, _): &&ShippedFile| !name.is_empty() && within(shipped);
+    files.iter().find(found).copied()
 }
 
 /// The names of the shipped files, for messages.
