@@ -75,8 +75,10 @@ pub(crate) struct RoverPhysics {
     colliders: Vec<rp::ColliderHandle>,
     statics: Vec<Option<rp::ColliderHandle>>,
     wheel_torque_nm: f64,
-    /// Torque of each wheel's drive in the last step, N m.
+    /// Torque of each wheel's drive at the end of the last step, N m.
     pub torque_nm: [f64; 6],
+    /// Angles and rates that the wheels' springs were set to for the last step.
+    last_command: [(f64, f64); 6],
 }
 
 /// A link and the joint that carries it.
@@ -141,6 +143,7 @@ impl RoverPhysics {
             statics,
             wheel_torque_nm: dynamics.wheel_torque_nm,
             torque_nm: [0.0; 6],
+            last_command: [(0.0, 0.0); 6],
         };
         rover.build(d, dynamics);
         rover.finish();
@@ -341,8 +344,11 @@ impl RoverPhysics {
             stalled[i] = possible != wheel_rad[i];
             wheel_rad[i] = possible;
             let lead = WHEEL_DAMPING_NMS_RAD * wheel_rate[i] / WHEEL_STIFFNESS_NM_RAD;
-            self.torque_nm[i] = WHEEL_STIFFNESS_NM_RAD * (possible - angle)
-                + WHEEL_DAMPING_NMS_RAD * (wheel_rate[i] - rate);
+            // Where the wheel is now it came to under the last step's command.
+            let (commanded, commanded_rate) = self.last_command[i];
+            self.torque_nm[i] = WHEEL_STIFFNESS_NM_RAD * (commanded - angle)
+                + WHEEL_DAMPING_NMS_RAD * (commanded_rate - rate);
+            self.last_command[i] = (possible, wheel_rate[i]);
             self.spring(self.wheels[i], WHEEL_STIFFNESS_NM_RAD, possible + lead);
         }
         stalled

@@ -194,6 +194,17 @@ impl World {
         }
     }
 
+    /// True pose of the mast's head, world frame, if there is a mast.
+    pub fn world_from_head(&self) -> Option<Isometry3<f64>> {
+        let mast = self.mast.as_ref()?;
+        Some(self.world_from_rover()? * mast.rover_from_head())
+    }
+
+    /// The true arm as it is mounted now.
+    pub fn arm_model(&self) -> &crate::ArmModel {
+        &self.model
+    }
+
     /// The arm's links and plunger, world frame.
     pub(super) fn arm_part_poses(&self) -> Vec<Isometry3<f64>> {
         if let (Some(carried), Some(pose)) = (&self.carried, self.world_from_rover()) {

@@ -5,14 +5,22 @@ use rover_messages::{
     Fault,
     imaging::{RawPair, StereoFrame},
 };
-use rover_robot::CameraPairDescription;
+use rover_robot::{CameraMount, CameraPairDescription, Robot};
 
-/// The frame of a raw pair: its images with the believed models (rover frame) of `pair`.
+/// The frame of a raw pair: its images with the believed models of `pair`, rover frame. The models
+/// of a pair on the mast are placed by the mast's kinematics at the angles that came with the
+/// images; the attitude that came with them takes the frame on to the site
+/// ([`StereoFrame::site_from_rover`]).
 ///
 /// # Errors
 /// Fault `wrong_pair` when the images are another pair's, `wrong_image_size` when a model is made
-/// for another size, `bad_frame` when the time is not a number.
-pub fn attach_models(images: RawPair, pair: &CameraPairDescription) -> Result<StereoFrame, Fault> {
+/// for another size, `bad_frame` when the time is not a number, `no_mast_angles` when a mast pair
+/// came without, `mast_moving` when it was exposed while the mast moved.
+pub fn attach_models(
+    images: RawPair,
+    robot: &Robot,
+    pair: &CameraPairDescription,
+) -> Result<StereoFrame, Fault> {
     let fault = |name, message: String| Fault::new(SERVICE, name, message);
     if images.pair != pair.name {
         return Err(fault(
@@ -51,8 +59,13 @@ pub fn attach_models(images: RawPair, pair: &CameraPairDescription) -> Result<St
             .with("expected_height_px", expected.1.into()));
         }
     }
-    Ok(StereoFrame {
-        images,
-        cameras: pair.cameras.clone(),
-    })
+    if pair.mount == CameraMount::Mast && images.mast.as_ref().is_some_and(|m| m.moving) {
+        let message = format!("the mast moved while the pair `{}` was exposed", pair.name);
+        return Err(fault("mast_moving", message));
+    }
+    let angles = images.mast.as_ref().map(|m| [m.pan_rad, m.tilt_rad]);
+    let cameras = robot
+        .cameras_at(pair, angles)
+        .map_err(|e| fault("no_mast_angles", format!("pair `{}`: {e}", pair.name)))?;
+    Ok(StereoFrame { images, cameras })
 }

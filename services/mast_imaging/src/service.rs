@@ -1,20 +1,27 @@
 //! The imaging service on the network: `imaging/<pair>/capture`, `.../left` and `.../right` for
-//! every camera pair of the robot.
+//! every camera pair of the robot, and `.../recall` for the last frames again.
 
 use crate::{SERVICE, attach_models};
 use rover_bus::{BusError, Peer, PictureStream};
 use rover_messages::{
     Fault,
-    imaging::{CaptureRequest, ImageData, RawPair, StereoFrame},
+    imaging::{CaptureRequest, FrameReference, ImageData, RawPair, StereoFrame},
     keys,
 };
 use rover_robot::{CameraPairDescription, Robot};
 use rover_service::{Service, ServiceShell};
 use rover_vision::{Image8, encode_png};
-use std::{sync::Arc, time::Duration};
+use std::{
+    collections::VecDeque,
+    sync::{Arc, Mutex, PoisonError},
+    time::Duration,
+};
 
 /// Wall-clock limit for one exposure.
 const GRAB_LIMIT: Duration = Duration::from_secs(60);
+
+/// Frames of each pair that can be recalled.
+const KEPT_FRAMES: usize = 8;
 
 /// Starts the service on `peer`; it lives as long as the returned value.
 ///
@@ -33,8 +40,19 @@ pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> 
             right: peer
                 .picture_stream(&keys::imaging_picture(&pair.name, "right"))
                 .await?,
+            robot: robot.clone(),
             pair: pair.clone(),
+            kept: Mutex::default(),
         });
+        let recalling = desk.clone();
+        let recall = peer.serve(
+            &keys::imaging_recall(&pair.name),
+            move |reference: FrameReference| {
+                let desk = recalling.clone();
+                async move { desk.recall(&reference) }
+            },
+        );
+        served.push(recall.await?);
         let key = keys::imaging_capture(&pair.name);
         let capture = peer.serve(&key, move |request: CaptureRequest| {
             let desk = desk.clone();
@@ -48,7 +66,10 @@ pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> 
 struct Desk {
     peer: Peer,
     shell: ServiceShell,
+    robot: Arc<Robot>,
     pair: CameraPairDescription,
+    /// The last frames with their exposures.
+    kept: Mutex<VecDeque<(u32, StereoFrame)>>,
     left: PictureStream,
     right: PictureStream,
 }
@@ -59,6 +80,41 @@ impl Desk {
         self.shell.answered(self.captured(request).await, "frames")
     }
 
+    fn keep(&self, exposure_n: u32, frame: &StereoFrame) {
+        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        kept.retain(|(n, f)| (*n, f.images.step) != (exposure_n, frame.images.step));
+        if kept.len() == KEPT_FRAMES {
+            kept.pop_front();
+        }
+        kept.push_back((exposure_n, frame.clone()));
+    }
+
+    fn recall(&self, reference: &FrameReference) -> Result<StereoFrame, Fault> {
+        let kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        let found = kept
+            .iter()
+            .find(|(n, f)| (*n, f.images.step) == (reference.exposure_n, reference.step))
+            .filter(|_| reference.pair == self.pair.name)
+            .map(|(_, f)| f.clone());
+        let known: Vec<String> = kept
+            .iter()
+            .map(|(n, f)| format!("{}/{n}", f.images.step))
+            .collect();
+        drop(kept);
+        let answer = found.ok_or_else(|| {
+            let message = format!(
+                "no frame of the pair `{}` with step {} and exposure {}; the last ones are \
+                 (step/exposure): {}",
+                reference.pair,
+                reference.step,
+                reference.exposure_n,
+                known.join(", ")
+            );
+            Fault::new(SERVICE, "frame_forgotten", message)
+        });
+        self.shell.answered(answer, "recalls")
+    }
+
     async fn captured(&self, request: CaptureRequest) -> Result<StereoFrame, Fault> {
         let key = keys::camera_grab(&self.pair.name);
         let images: RawPair = self
@@ -66,7 +122,8 @@ impl Desk {
             .ask(&key, &request, GRAB_LIMIT)
             .await
             .map_err(|e| e.into_fault(SERVICE))?;
-        let frame = attach_models(images, &self.pair)?;
+        let frame = attach_models(images, &self.robot, &self.pair)?;
+        self.keep(request.exposure_n, &frame);
         show(&self.left, &frame.images.left);
         show(&self.right, &frame.images.right);
         Ok(frame)
