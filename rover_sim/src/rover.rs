@@ -14,7 +14,7 @@ pub(crate) use shape::vehicle_parts;
 
 use crate::{
     SimulationError,
-    description::{RoverStart, SimulationDescription, SoilDescription},
+    description::{RoverStart, SimulationDescription},
     terrain::Terrain,
     world::levelled,
 };
@@ -88,11 +88,7 @@ impl Vehicle {
         )?;
         let mut drive = Drive::new(parts.mobility, d.step_s);
         settle(&mut physics, &mut drive, d.step_s)?;
-        let soil = d
-            .terrain
-            .soil
-            .clone()
-            .unwrap_or_else(SoilDescription::default);
+        let soil = d.terrain.soil.clone().unwrap_or_default();
         let scale = d.truth.mobility_scale.unwrap_or(1.0);
         let standing = physics.world_from_rover();
         let v = parts.dynamics;

@@ -1,8 +1,8 @@
 //! The verbs of the command line, one file each.
 
-pub mod campaign;
 pub mod arm;
 pub mod camera;
+pub mod campaign;
 pub mod doctor;
 pub mod inspect;
 pub mod run;

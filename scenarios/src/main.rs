@@ -1,7 +1,9 @@
 //! The `rover` command.
 
 use clap::{Parser, Subcommand};
-use rover::commands::{CommandError, Exit, arm, camera, campaign, doctor, inspect, run, service, study, up, vision};
+use rover::commands::{
+    CommandError, Exit, arm, camera, campaign, doctor, inspect, run, service, study, up, vision,
+};
 use std::{io::IsTerminal, process::ExitCode};
 use tracing_subscriber::EnvFilter;
 

@@ -18,7 +18,7 @@ impl Method for Kinematic {
     }
 
     fn duplicate(&self) -> Box<dyn Method> {
-        Box::new(self.clone())
+        Box::new(*self)
     }
 
     fn state_bytes(&self) -> usize {

@@ -1,5 +1,7 @@
 //! URDF input: forward kinematics against an independent reader of the format, and refusals.
 #![allow(clippy::unwrap_used, clippy::expect_used)]
+// Angles as files write them, with the digits that they give.
+#![allow(clippy::approx_constant)]
 
 use k::nalgebra as other;
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
@@ -408,7 +410,7 @@ fn meshes_are_found_beside_the_file_and_in_packages() {
         urdf.meshes.iter().map(|m| m.path.is_some()).collect()
     };
     assert_eq!(found(&[]), [false, true, false]);
-    assert_eq!(found(&[packages.clone()]), [true, true, false]);
+    assert_eq!(found(std::slice::from_ref(&packages)), [true, true, false]);
     assert_eq!(found(&[packages.join("idd")]), [true, true, false]);
 }
 

@@ -45,13 +45,11 @@ pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> 
             kept: Mutex::default(),
         });
         let recalling = desk.clone();
-        let recall = peer.serve(
-            &keys::imaging_recall(&pair.name),
-            move |reference: FrameReference| {
-                let desk = recalling.clone();
-                async move { desk.recall(&reference) }
-            },
-        );
+        let key = keys::imaging_recall(&pair.name);
+        let recall = peer.serve(&key, move |reference: FrameReference| {
+            let desk = recalling.clone();
+            async move { desk.recall(&reference) }
+        });
         served.push(recall.await?);
         let key = keys::imaging_capture(&pair.name);
         let capture = peer.serve(&key, move |request: CaptureRequest| {

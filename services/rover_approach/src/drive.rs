@@ -264,8 +264,10 @@ mod tests {
     fn on_open_ground_the_rover_heads_for_its_goal() {
         let open = ground(|_, _| 0.0);
         let m = next([5.0, 0.0], &open).unwrap();
-        let straight = |arc: &DriveArc| matches!(*arc, DriveArc::Arc { length_m, curvature_1_m }
-            if (length_m - 0.9).abs() < 1e-9 && curvature_1_m == 0.0);
+        let straight = |arc: &DriveArc| {
+            matches!(*arc, DriveArc::Arc { length_m, curvature_1_m }
+            if (length_m - 0.9).abs() < 1e-9 && curvature_1_m == 0.0)
+        };
         assert!(straight(&m.arc), "{m:?}");
         let m = next([4.0, 1.0], &open).unwrap();
         assert!(m.end.local(&Vector2::new(4.0, 1.0)).norm() < 4.12 - 0.6);

@@ -570,6 +570,7 @@ impl<'a> Session<'a> {
     }
 }
 
+#[allow(clippy::large_enum_variant)] // one lives at a time
 enum NearStep {
     Move(DriveArc),
     Stay(Serving, BaseChoice),

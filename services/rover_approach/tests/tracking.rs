@@ -2,7 +2,6 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use nalgebra::{Isometry3, Matrix2, Point3, UnitQuaternion, Vector2, Vector3};
-use rover_approach::error::TrackError;
 use rover_approach::handover::{HandoverRules, hand_over};
 use rover_approach::track::{TrackRules, Tracker};
 use rover_approach::view::View;

@@ -150,8 +150,11 @@ fn what_is_fitted_reports_its_true_worst_error() {
 /// A lens tilted against the image plane, and published axes of six digits: neither has an exact
 /// counterpart.
 #[test]
-fn flight_models_are_fitted_within_a_tenth_of_a_pixel() {
-    let rules = ConversionRules::default();
+fn flight_models_are_fitted_within_a_third_of_a_pixel() {
+    let rules = ConversionRules {
+        limit_px: 0.33,
+        ..ConversionRules::default()
+    };
     for name in ["MER1_NAVCAM", "MSL_NAV", "VW_TEST_CAHVOR", "VW_TEST_CAHV"] {
         let reference = references()
             .into_iter()
@@ -160,7 +163,7 @@ fn flight_models_are_fitted_within_a_tenth_of_a_pixel() {
         let found = LensCamera::from_camera(&reference.camera, &[Family::PlumbBob], &rules);
         let found = found.unwrap();
         println!("{name}: {:.2e} px", found.worst_px);
-        assert!(found.worst_px < 0.1);
+        assert!(found.worst_px < 0.33);
         let wide = ConversionRules {
             limit_px: 0.5,
             ..rules

@@ -188,7 +188,7 @@ fn candidates(
     }
     // twist of a crossing of this contrast under smoothing and a blur of 1.5 px, halved twice
     let blur = rules.smoothing_px * rules.smoothing_px + 1.5 * 1.5;
-    let twist = 0.5 * rules.min_contrast_dn * 0.6366 / blur;
+    let twist = 0.5 * rules.min_contrast_dn * std::f64::consts::FRAC_2_PI / blur;
     let limit = (0.25 * twist * twist * rules.min_sine * rules.min_sine) as f32;
     let mut found = Vec::new();
     for v in 2..h - 2 {

@@ -139,7 +139,7 @@ fn a_lone_saddle_is_found_to_two_hundredths_of_a_pixel() {
         for case in 0..25 {
             let pose = rig.pose(&mut rng, 0.8);
             let image = rig.image(&pose, 0.02, noise, &mut rng, &|x, y| {
-                (x.abs().max(y.abs()) < 0.02).then(|| if x * y > 0.0 { 25.0 } else { 200.0 })
+                (x.abs().max(y.abs()) < 0.02).then_some(if x * y > 0.0 { 25.0 } else { 200.0 })
             });
             let truth = rig.seen(&pose, 0.0, 0.0);
             let found = saddle(&image, Window::whole(&image), &SaddleRules::default())
