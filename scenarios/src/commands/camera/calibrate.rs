@@ -102,7 +102,7 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<(), CommandError> {
             args.right.len()
         )));
     }
-    if !(args.linearity.abs() <= 1.0) {
+    if !(-1.0..=1.0).contains(&args.linearity) {
         return Err(CommandError::BadInput(format!(
             "--linearity {}: expected -1 to 1",
             args.linearity

@@ -109,7 +109,7 @@ pub fn numbers<const N: usize>(found: &str) -> Result<[f64; N], String> {
 pub fn pose(found: &str) -> Result<Isometry3<f64>, String> {
     let [x, y, z, w, i, j, k] = numbers::<7>(found)?;
     let q = Quaternion::new(w, i, j, k);
-    if !((q.norm() - 1.0).abs() < 1e-3) {
+    if !(0.999..=1.001).contains(&q.norm()) {
         return Err(format!(
             "the quaternion of `{found}` has length {}, 1 is expected",
             q.norm()
