@@ -47,7 +47,7 @@ fn help_names_what_works_and_nothing_else() {
     let out = rover(elsewhere().path(), &["--help"]);
     assert_eq!(out.status.code(), Some(0));
     let help = text(&out.stdout);
-    for verb in ["run", "up", "service", "inspect", "doctor"] {
+    for verb in ["run", "up", "service", "inspect", "camera", "doctor"] {
         assert!(
             help.lines().any(|l| l.trim_start().starts_with(verb)),
             "{verb}: {help}"
