@@ -4,7 +4,7 @@
 
 use nalgebra::{Isometry3, Point3, Unit, Vector2, Vector3};
 use rover_cameras::{
-    Camera,
+    Camera, StereoPair,
     formats::{read_text, write_text},
 };
 use rover_vision::Image8;
@@ -333,9 +333,24 @@ fn a_pair_is_calibrated_from_pictures_alone() {
     assert!(read("residuals.html").contains("<svg"));
     let found = read_text(&read("right.cahvor")).unwrap();
     assert_eq!(found.frame.as_deref(), Some("left_camera"));
-    let point = Vector3::new(0.02, 0.03, 0.45);
-    let error = found.model.project(&point).unwrap() - right.project(&point).unwrap();
-    assert!(error.norm() < 0.5, "{error}");
+    // The frame is the left camera's own, so what can be compared is what the pair measures.
+    let pair = StereoPair {
+        left: read_text(&read("left.cahvor")).unwrap().camera().unwrap(),
+        right: found.camera().unwrap(),
+    };
+    let measured = [[0.02, 0.03, 0.45], [-0.04, -0.02, 0.4]].map(|at| {
+        let point = Vector3::from(at);
+        let (l, r) = (
+            left.project(&point).unwrap(),
+            right.project(&point).unwrap(),
+        );
+        let seen = pair.triangulate(&l, &r).unwrap();
+        assert!(seen.miss_m < 3e-4, "{seen:?}");
+        (point, seen.point)
+    });
+    let [(a, seen_a), (b, seen_b)] = measured;
+    let error_m = (seen_a - seen_b).norm() - (a - b).norm();
+    assert!(error_m.abs() < 5e-4, "{error_m} m");
     refused(folder.path(), &args, &["--force"]);
     refused(
         folder.path(),
