@@ -1,6 +1,8 @@
 //! `rover arm` on one's own files: reference poses, tables, refusals.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
+// Angles as the table writes them.
+#![allow(clippy::approx_constant)]
 
 use std::{
     io::Write,

@@ -47,11 +47,9 @@ fn help_names_what_works_and_nothing_else() {
     let out = rover(elsewhere().path(), &["--help"]);
     assert_eq!(out.status.code(), Some(0));
     let help = text(&out.stdout);
-<<<<<<< HEAD
-    for verb in ["run", "up", "service", "inspect", "arm", "doctor"] {
-=======
-    for verb in ["run", "up", "service", "inspect", "camera", "doctor"] {
->>>>>>> wip-cam
+    for verb in [
+        "run", "up", "campaign", "study", "service", "inspect", "camera", "arm", "vision", "doctor",
+    ] {
         assert!(
             help.lines().any(|l| l.trim_start().starts_with(verb)),
             "{verb}: {help}"
