@@ -558,7 +558,8 @@ impl Comparison {
              alone {} mm; blind for the last 10 cm EPEC {} mm, the field with a kinematic prior \
              {} mm. In the median EPEC is beaten, fiducial at the tip: {}. HIPS is {} times better \
              than kinematics in its limited and {} times in its full version (published: about 2 \
-             and about 10). Position-based servoing with gain 1 is EPEC by another name.",
+             and about 10); the height of its initial poses was chosen among three so that the \
+             limited version agrees with the independent program. Position-based servoing with gain 1 is EPEC by another name.",
             number(at(Kind::Epec, 0)),
             number(at(Kind::Kinematic, 0)),
             number(at(Kind::Epec, 10)),

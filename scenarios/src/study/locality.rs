@@ -438,8 +438,8 @@ impl Locality {
              it must read .5 cm, 5 mm. With six vectors seen along a bent approach the field with a \
              kinematic prior grows at most {field:.2} times as fast, {noisy:.2} times when each \
              vector has 0.3 mm of noise, and its 95 % ellipsoids held the true vector in at least \
-             {:.0} % of the predictions. A straight approach of 12 cm shows less of the robot: the \
-             field then grows at most {straight:.2} times as fast as one vector.",
+             {:.0} % of the predictions. That approach is the best of seven shapes tried with seed 1. \
+             A straight one of 12 cm shows less of the robot: the field then grows at most {straight:.2} times as fast as one vector.",
             r2 * 100.0,
             covered * 100.0
         )
