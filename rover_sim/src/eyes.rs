@@ -377,8 +377,11 @@ fn mean_normal(mesh: &Mesh, centre: &Vector3<f64>, radius_m: f64) -> Vector3<f64
     let mut sum = Vector3::zeros();
     for t in &mesh.triangles {
         let [a, b, c] = t.map(|i| mesh.positions[i as usize]);
-        let reach = (b - a).norm().max((c - a).norm()) + radius_m;
-        if (a - centre).norm() > reach {
+        let apart = |k: usize| {
+            a[k].max(b[k]).max(c[k]) < centre[k] - radius_m
+                || a[k].min(b[k]).min(c[k]) > centre[k] + radius_m
+        };
+        if (0..3).any(apart) {
             continue;
         }
         let normal = (b - a).cross(&(c - a));

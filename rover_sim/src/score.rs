@@ -65,6 +65,7 @@ impl World {
         Ok(Score {
             target_in_world_m: at.into(),
             normal_in_world: normal.into_inner().into(),
+            believed_in_world_m: believed_target.coords.into(),
             contact_in_world_m: contact.map(|c| c.point_m.into()),
             lateral_error_mm: apart.map(|d| lateral(&d, &normal).norm() * 1e3),
             range_error_mm: apart.map(|d| d.dot(&normal) * 1e3),

@@ -5,11 +5,14 @@ pub mod camera;
 pub mod campaign;
 pub mod doctor;
 pub mod inspect;
+mod line;
 pub mod run;
 pub mod service;
 pub mod study;
 pub mod up;
 pub mod vision;
+
+pub use line::main;
 
 use crate::{
     html::PageError,

@@ -7,6 +7,10 @@ pub type ShippedFile = (&'static str, &'static str);
 /// Shipped scenarios.
 pub const SCENARIOS: &[ShippedFile] = &[
     (
+        "scenarios/single_cycle.toml",
+        include_str!("../single_cycle.toml"),
+    ),
+    (
         "scenarios/bluestreak.toml",
         include_str!("../bluestreak.toml"),
     ),

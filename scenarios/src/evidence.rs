@@ -4,6 +4,7 @@
 use rover_bus::{BusError, Peer};
 use rover_messages::{
     Nothing,
+    approach::DriveToFeedback,
     imaging::{CaptureRequest, ImageData, StereoFrame},
     keys,
     placement::Look,
@@ -17,6 +18,12 @@ use std::time::Duration;
 pub struct Evidence {
     /// The images in which the target was designated.
     pub designation: Option<StereoFrame>,
+    /// The target as the approach found it again at its stops.
+    pub stops: Vec<StopPicture>,
+    /// Outside views of the rover: where it set out from, and where it stands before the target.
+    pub chase_views: Vec<ImageData>,
+    /// The target in the pair that the arm works with.
+    pub handed_over: Option<Target>,
     /// The images at the end of the servo.
     pub standoff: Option<StereoFrame>,
     /// Outside view of the instrument in contact, or where the contact motion ended.
@@ -31,8 +38,22 @@ pub struct Evidence {
     pub score: Option<Score>,
 }
 
-/// An outside camera: where it stands and what it looks at, both seen from the instrument's tip,
-/// and its horizontal field of view.
+/// The target in one image of the approach.
+#[derive(Clone, Debug)]
+pub struct StopPicture {
+    /// The left image.
+    pub image: ImageData,
+    /// Where the target was found, px.
+    pub pixel_px: [f64; 2],
+    /// Believed distance along the ground, m.
+    pub range_m: f64,
+    /// Correlation of the match, 0 to 1.
+    pub score: Option<f64>,
+}
+
+/// An outside camera: where it stands and what it looks at, both seen from the instrument's tip
+/// (or, for the chase camera, from the rover frame's origin) along the rover's heading, and its
+/// horizontal field of view.
 struct Outside {
     eye_m: [f64; 3],
     look_at_m: [f64; 3],
@@ -52,9 +73,46 @@ const WIDE: Outside = Outside {
     field_of_view_deg: 40.0,
 };
 
+/// The whole rover, from behind and to the right.
+const CHASE: Outside = Outside {
+    eye_m: [-2.6, -1.9, 1.9],
+    look_at_m: [0.7, 0.1, 0.4],
+    field_of_view_deg: 50.0,
+};
+
 impl Evidence {
-    pub(crate) async fn designated(&mut self, peer: &Peer, pair: &str, limit: Duration) {
-        self.designation = kept("images", capture(peer, pair, limit).await);
+    /// Keeps the picture of a stop at which the target was found.
+    pub(crate) async fn under_way(
+        &mut self,
+        peer: &Peer,
+        feedback: &DriveToFeedback,
+        limit: Duration,
+    ) {
+        if self.chase_views.is_empty() {
+            self.chase(peer, limit).await;
+        }
+        let (Some(frame), Some(pixel_px)) = (&feedback.frame, feedback.pixel_px) else {
+            return;
+        };
+        let key = keys::imaging_recall(&frame.pair);
+        let recalled = peer.ask(&key, frame, limit);
+        if let Some(frame) = kept::<StereoFrame>("image of a stop", recalled.await) {
+            self.stops.push(StopPicture {
+                image: frame.images.left,
+                pixel_px,
+                range_m: feedback.range_m,
+                score: feedback.score,
+            });
+        }
+    }
+
+    pub(crate) async fn arrived(&mut self, peer: &Peer, limit: Duration) {
+        self.chase(peer, limit).await;
+    }
+
+    async fn chase(&mut self, peer: &Peer, limit: Duration) {
+        self.chase_views
+            .extend(kept("view", view(peer, &CHASE, About::Rover, limit).await));
     }
 
     pub(crate) async fn at_standoff(&mut self, peer: &Peer, pair: &str, limit: Duration) {
@@ -70,13 +128,13 @@ impl Evidence {
 
     pub(crate) async fn in_contact(&mut self, peer: &Peer, limit: Duration) {
         if self.contact_view.is_none() {
-            self.contact_view = kept("view", view(peer, &CLOSE, limit).await);
+            self.contact_view = kept("view", view(peer, &CLOSE, About::Tip, limit).await);
         }
     }
 
     pub(crate) async fn after_contact(&mut self, peer: &Peer, limit: Duration) {
         self.in_contact(peer, limit).await;
-        self.scene_view = kept("view", view(peer, &WIDE, limit).await);
+        self.scene_view = kept("view", view(peer, &WIDE, About::Tip, limit).await);
     }
 }
 
@@ -95,10 +153,29 @@ async fn capture(peer: &Peer, pair: &str, limit: Duration) -> Result<StereoFrame
     .await
 }
 
-async fn view(peer: &Peer, from: &Outside, limit: Duration) -> Result<ImageData, BusError> {
+/// What an outside camera is placed by.
+#[derive(Clone, Copy, PartialEq)]
+enum About {
+    Tip,
+    Rover,
+}
+
+async fn view(
+    peer: &Peer,
+    from: &Outside,
+    about: About,
+    limit: Duration,
+) -> Result<ImageData, BusError> {
     let truth: TruthState = peer.ask(keys::SIM_TRUTH_STATE, &Nothing {}, limit).await?;
-    let tip = truth.tip_in_world_m;
-    let at = |offset: [f64; 3]| [0, 1, 2].map(|i| tip[i] + offset[i]);
+    let origin_m = match (about, &truth.rover) {
+        (About::Rover, Some(rover)) => rover.position_m,
+        _ => truth.tip_in_world_m,
+    };
+    let (sin, cos) = truth.rover.map_or(0.0, |rover| rover.rpy_rad[2]).sin_cos();
+    let at = |[x, y, z]: [f64; 3]| {
+        let turned = [cos * x - sin * y, sin * x + cos * y, z];
+        [0, 1, 2].map(|i| origin_m[i] + turned[i])
+    };
     let request = ViewRequest {
         eye_m: at(from.eye_m),
         look_at_m: at(from.look_at_m),

@@ -1,6 +1,7 @@
 //! A run as one self-contained page: numbers, pictures, plots, the effective scenario. The page
 //! refers to nothing outside of itself.
 
+mod approach;
 mod bullseye;
 mod picture;
 pub(crate) mod plot;
@@ -50,6 +51,7 @@ pub fn page(
     body += &cards(report);
     body += &views(evidence)?;
     body += &images(evidence)?;
+    body += &approach::approach(report, evidence)?;
     body += &servo(report, evidence);
     body += &section("Timeline", &timeline::timeline(&report.phases));
     body += &section("Measured against the truth", &truth(report, evidence));
@@ -213,6 +215,7 @@ fn images(evidence: &Evidence) -> Result<String, PageError> {
             &format!("<div class=\"pair\">{figures}</div>"),
         );
     }
+    let target = evidence.handed_over.as_ref().or(target);
     if let Some(frame) = &evidence.standoff {
         let mut figures = String::new();
         for (image, pixel, side, of) in [

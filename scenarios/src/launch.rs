@@ -15,6 +15,7 @@ use crate::{
 use child::Child;
 use rover_bus::{BusError, NetworkConfig, Peer, Presence, Role};
 use rover_messages::{Fault, keys::service};
+use rover_robot::Robot;
 use std::{path::PathBuf, time::Duration};
 
 pub use child::READY;
@@ -122,9 +123,17 @@ enum Running {
     Process(Box<Child>),
 }
 
-/// All parts in starting order: the hardware, then the services.
+/// All parts there are, in starting order: the hardware, then the services.
 pub fn part_names() -> impl Iterator<Item = &'static str> {
-    std::iter::once(service::HARDWARE).chain(service::ALL)
+    std::iter::once(service::HARDWARE)
+        .chain(service::ALL)
+        .chain([service::ROVER_APPROACH])
+}
+
+/// The parts that a robot needs, in starting order: the approach only if it drives.
+pub fn parts_of(robot: &Robot) -> impl Iterator<Item = &'static str> {
+    let drives = robot.mobility().is_ok() && robot.mast().is_ok();
+    part_names().filter(move |name| drives || *name != service::ROVER_APPROACH)
 }
 
 impl System {
@@ -143,7 +152,7 @@ impl System {
         };
         let mut parts = Vec::new();
         let mut endpoints: Vec<String> = Vec::new();
-        for name in part_names() {
+        for name in parts_of(&loaded.robot) {
             let started = match (&options.mode, &files) {
                 (Mode::Processes { program }, Some(files)) => {
                     let command = child::command(
@@ -243,7 +252,7 @@ async fn runner(
     let mut config = NetworkConfig::new(loaded.robot.name(), RUNNER, Role::Runner, endpoints);
     config.listen.clone_from(&options.listen);
     let peer = Peer::open(config).await.map_err(&error)?;
-    let names: Vec<_> = part_names().collect();
+    let names: Vec<_> = parts_of(&loaded.robot).collect();
     let limit = loaded.scenario.limits.start();
     let announced = async {
         peer.await_presence(&names, limit).await?;

@@ -1,29 +1,36 @@
 //! The mission: designate, survey, servo, contact, score, stow. It talks to the services through
 //! their keys alone and would run unchanged against real hardware, but for the score.
 
+mod abort;
+mod command;
+mod way;
+
+pub use abort::Abort;
+
 use crate::{
     evidence::Evidence,
-    report::{ContactReport, Outcome, Phase, RunReport, ServoReport, TargetReport, TruthReport},
+    report::{
+        ApproachReport, ContactReport, Outcome, Phase, RunReport, ServoReport, TargetReport,
+        TruthReport, Waypoints,
+    },
     scenario::Scenario,
 };
-use rover_bus::{BusError, GoalState, Peer};
+use command::{act, unless};
+use rover_bus::{BusError, Peer};
 use rover_kinematics::{AxisGoal, closest_solution};
 use rover_messages::{
-    Fault, Nothing, Wire,
+    Fault, Nothing,
+    approach::{DriveToFeedback, DriveToResult},
     arm::{ArmState, ExecuteFeedback, ExecuteGoal, ExecuteResult, Guard},
     keys,
+    mobility::WheelsState,
     placement::{ContactFeedback, ContactResult, PlaceFeedback, PlaceResult},
     planning::{Plan, PlanGoal, PlanRequest, SurveyReport, SurveyRequest},
-    simulation::{Score, ScoreRequest},
-    target::{SelectRequest, Target},
+    simulation::{Score, ScoreRequest, TruthState},
+    target::Target,
 };
 use rover_robot::Robot;
-use std::{
-    future::Future,
-    sync::Arc,
-    time::{Duration, Instant},
-};
-use tokio::sync::watch;
+use std::time::{Duration, Instant};
 
 /// Name under which the runner announces itself and commands.
 pub const RUNNER: &str = "runner";
@@ -35,6 +42,10 @@ const CANCEL_LIMIT: Duration = Duration::from_secs(5);
 pub trait Observer: Send {
     /// A phase begins.
     fn phase(&mut self, _name: &str) {}
+    /// The target was selected.
+    fn target(&mut self, _target: &Target) {}
+    /// The approach reports.
+    fn approach(&mut self, _feedback: &DriveToFeedback) {}
     /// The servo reports.
     fn servo(&mut self, _feedback: &PlaceFeedback) {}
     /// The contact motion reports.
@@ -47,47 +58,6 @@ pub trait Observer: Send {
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Unobserved;
 impl Observer for Unobserved {}
-
-/// Tells a running mission to end early, and why; the first reason counts.
-#[derive(Clone, Debug)]
-pub struct Abort {
-    reason: Arc<watch::Sender<Option<Fault>>>,
-}
-
-impl Default for Abort {
-    fn default() -> Self {
-        Self {
-            reason: Arc::new(watch::Sender::new(None)),
-        }
-    }
-}
-
-impl Abort {
-    /// Ends the mission with this reason.
-    pub fn now(&self, reason: Fault) {
-        self.reason.send_if_modified(|present| {
-            let first = present.is_none();
-            if first {
-                *present = Some(reason);
-            }
-            first
-        });
-    }
-
-    /// The reason, as soon as there is one.
-    pub async fn requested(&self) -> Fault {
-        let mut reason = self.reason.subscribe();
-        loop {
-            if let Some(fault) = reason.borrow_and_update().clone() {
-                return fault;
-            }
-            // The sender lives in `self`, so a change always comes or nobody ever asks.
-            if reason.changed().await.is_err() {
-                std::future::pending::<()>().await;
-            }
-        }
-    }
-}
 
 /// One run of one scenario on a network that is up.
 pub struct Mission<'a> {
@@ -105,9 +75,11 @@ pub struct Mission<'a> {
 #[derive(Clone, Debug, Default)]
 struct Record {
     target: Option<Target>,
+    approach: Option<DriveToResult>,
     placed: Option<PlaceResult>,
     contact: Option<ContactReport>,
     score: Option<Score>,
+    waypoints: Waypoints,
 }
 
 impl<'a> Mission<'a> {
@@ -141,7 +113,7 @@ impl<'a> Mission<'a> {
         let mut record = Record::default();
         let mut ended = self.place(&mut record).await;
         if ended.is_err() {
-            self.stop_arm().await;
+            self.stop().await;
         }
         let scoring = self
             .peer
@@ -149,7 +121,8 @@ impl<'a> Mission<'a> {
             .await
             .unwrap_or(false);
         if let Some(target) = record.target.clone().filter(|_| scoring) {
-            let scored = self.score(&target).await;
+            let handed_over = record.approach.as_ref().map(|a| a.target.clone());
+            let scored = self.score(&target, handed_over).await;
             match scored {
                 Ok(score) => record.score = Some(score),
                 Err(fault) => ended = ended.and(Err(fault)),
@@ -158,7 +131,7 @@ impl<'a> Mission<'a> {
         if ended.is_ok() && !self.scenario.arm.end_posture.is_empty() {
             ended = self.stow().await;
             if ended.is_err() {
-                self.stop_arm().await;
+                self.stop().await;
             }
         }
         let report = self.report(&record, ended.err());
@@ -175,31 +148,24 @@ impl<'a> Mission<'a> {
         let question_limit = scenario.limits.question();
         self.sim_time_s = self.now_s().await.unwrap_or_default();
 
-        let request = SelectRequest {
-            pair: scenario.target.pair.clone(),
-            pixel_px: scenario.target.pixel_px,
-        };
-        let started = self.begin("designate");
-        let abort = self.abort.clone();
-        let selected = unless(
-            &abort,
-            peer.ask::<_, Target>(keys::TARGET_SELECT, &request, question_limit),
-        )
-        .await;
-        let target = self.end(started, selected).await?;
-        if let Some(evidence) = &mut self.evidence {
-            evidence
-                .designated(peer, &scenario.target.pair, question_limit)
-                .await;
-        }
+        let (target, anchor) = self.designate().await?;
         record.target = Some(target.clone());
+        let target = match &scenario.approach_under_the_sun() {
+            Some(settings) => {
+                let reached = self.drive_to(settings.goal(&target, anchor)).await?;
+                record.approach = Some(reached.clone());
+                record.waypoints = self.waypoints(&reached).await?;
+                reached.target
+            }
+            None => target,
+        };
 
         let started = self.begin("survey");
         let request = SurveyRequest {
-            pair: scenario.target.pair.clone(),
+            pair: target.pair.clone(),
         };
         let surveyed = unless(
-            &abort,
+            &self.abort,
             peer.ask::<_, SurveyReport>(keys::PLANNER_SURVEY, &request, question_limit),
         )
         .await;
@@ -210,7 +176,7 @@ impl<'a> Mission<'a> {
         let (observer, evidence) = (&mut *self.observer, &mut self.evidence);
         let placed = act(
             peer,
-            &abort,
+            &self.abort,
             scenario.limits.action(),
             keys::SERVO_PLACE,
             &goal,
@@ -226,17 +192,21 @@ impl<'a> Mission<'a> {
         if let Some(evidence) = &mut self.evidence {
             evidence.looks.clone_from(&placed.looks);
             evidence
-                .at_standoff(peer, &scenario.target.pair, question_limit)
+                .at_standoff(peer, &target.pair, question_limit)
                 .await;
         }
         record.placed = Some(placed.clone());
+        if self.is_simulated().await {
+            let truth: TruthState = self.ask(keys::SIM_TRUTH_STATE, &Nothing {}).await?;
+            record.waypoints.at_standoff(&truth);
+        }
 
         let started = self.begin("contact");
         let goal = scenario.contact_goal(&target, &placed);
         let (observer, evidence) = (&mut *self.observer, &mut self.evidence);
         let contact = act(
             peer,
-            &abort,
+            &self.abort,
             scenario.limits.action(),
             keys::CONTACT_APPROACH,
             &goal,
@@ -262,15 +232,20 @@ impl<'a> Mission<'a> {
     }
 
     /// Measures the placement against the truth; the simulator's privilege.
-    async fn score(&mut self, target: &Target) -> Result<Score, Fault> {
+    async fn score(
+        &mut self,
+        target: &Target,
+        handed_over: Option<Target>,
+    ) -> Result<Score, Fault> {
         let started = self.begin("score");
         let limit = self.scenario.limits.question();
         let scored = async {
             let state: ArmState = self.peer.latest(keys::ARM_STATE, limit).await?;
-            let open_loop_joints_rad = open_loop_joints(self.robot, target, &state.joints_rad);
+            let believed = handed_over.as_ref().unwrap_or(target);
+            let open_loop_joints_rad = open_loop_joints(self.robot, believed, &state.joints_rad);
             let request = ScoreRequest {
                 target: target.clone(),
-                handed_over: None,
+                handed_over,
                 open_loop_joints_rad,
             };
             self.peer
@@ -323,14 +298,18 @@ impl<'a> Mission<'a> {
         self.end(started, stowed).await
     }
 
-    /// Stops the arm; a network on which nobody answers has no arm to stop.
-    async fn stop_arm(&self) {
-        let stopped = self
-            .peer
-            .ask::<_, ArmState>(keys::ARM_STOP, &Nothing {}, CANCEL_LIMIT)
-            .await;
-        if let Err(error) = stopped {
+    /// Stops the arm and the wheels; a network on which nobody answers has none to stop.
+    async fn stop(&self) {
+        let peer = self.peer;
+        let arm = peer.ask::<_, ArmState>(keys::ARM_STOP, &Nothing {}, CANCEL_LIMIT);
+        if let Err(error) = arm.await {
             tracing::warn!(%error, "arm/stop was not answered");
+        }
+        if self.robot.mobility().is_ok() {
+            let wheels = peer.ask::<_, WheelsState>(keys::WHEELS_STOP, &Nothing {}, CANCEL_LIMIT);
+            if let Err(error) = wheels.await {
+                tracing::warn!(%error, "wheels/stop was not answered");
+            }
         }
     }
 
@@ -384,12 +363,16 @@ impl<'a> Mission<'a> {
             reason: ended.map(|fault| format!("{}: {}", fault.name, fault.message)),
             phases: self.phases.clone(),
             target: record.target.as_ref().map(TargetReport::from),
+            approach: record.approach.as_ref().map(ApproachReport::from),
             servo: record
                 .placed
                 .as_ref()
                 .map(|placed| ServoReport::new(method, placed)),
             contact: record.contact.clone(),
-            truth: record.score.as_ref().map(TruthReport::from),
+            truth: record
+                .score
+                .as_ref()
+                .map(|score| TruthReport::new(score, &record.waypoints)),
             digest: String::new(),
         }
     }
@@ -404,72 +387,4 @@ pub fn open_loop_joints(robot: &Robot, target: &Target, near_rad: &[f64]) -> Opt
         axis: (arm_base_from_rover * -target.normal).unit,
     };
     closest_solution(&robot.arm, &robot.tool, &goal, near_rad).ok()
-}
-
-/// The answer, unless the run is aborted before it comes.
-async fn unless<T>(
-    abort: &Abort,
-    answer: impl Future<Output = Result<T, BusError>>,
-) -> Result<T, Fault> {
-    tokio::select! {
-        biased;
-        reason = abort.requested() => Err(reason),
-        answer = answer => answer.map_err(|e| e.into_fault(RUNNER)),
-    }
-}
-
-/// Commands an action and follows it to its end; an abort or the limit cancels it.
-async fn act<G: Wire, F: Wire, R: Wire>(
-    peer: &Peer,
-    abort: &Abort,
-    limit: Duration,
-    key: &str,
-    goal: &G,
-    mut on_feedback: impl AsyncFnMut(&F),
-) -> Result<R, Fault> {
-    let fault = |error: BusError| error.into_fault(RUNNER);
-    let mut goal = unless(abort, peer.command::<G, F, R>(key, goal)).await?;
-    let deadline = tokio::time::Instant::now() + limit;
-    loop {
-        let early = tokio::select! {
-            biased;
-            progress = goal.beat() => {
-                let progress = progress.map_err(fault)?;
-                if let Some(feedback) = &progress.feedback {
-                    on_feedback(feedback).await;
-                }
-                match progress.state {
-                    GoalState::Accepted | GoalState::Running => continue,
-                    GoalState::Succeeded => return progress.result.ok_or_else(|| {
-                        Fault::new(RUNNER, "bad_message", format!("{key}: success without result"))
-                    }),
-                    _ => return Err(progress.fault.unwrap_or_else(|| {
-                        Fault::new(RUNNER, "cancelled", format!("{key}: the goal was cancelled"))
-                    })),
-                }
-            }
-            reason = abort.requested() => reason,
-            () = tokio::time::sleep_until(deadline) => Fault::new(
-                RUNNER,
-                "timeout",
-                format!("{key}: not finished after limits.action_s = {} s", limit.as_secs_f64()),
-            ),
-        };
-        // Ends by itself once the goal is cancelled; the reason for the abort is what counts.
-        let wound_down = async {
-            goal.cancel().await?;
-            loop {
-                let state = goal.beat().await?.state;
-                if !matches!(state, GoalState::Accepted | GoalState::Running) {
-                    return Ok::<(), BusError>(());
-                }
-            }
-        };
-        match tokio::time::timeout(CANCEL_LIMIT, wound_down).await {
-            Ok(Ok(())) => {}
-            Ok(Err(error)) => tracing::warn!(%error, key, "the cancelled goal was lost"),
-            Err(_) => tracing::warn!(key, "the cancelled goal did not end in time"),
-        }
-        return Err(early);
-    }
 }

@@ -3,7 +3,11 @@
 
 use crate::{placement::Observer, report::Phase};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use rover_messages::placement::{ContactFeedback, PlaceFeedback};
+use rover_messages::{
+    approach::DriveToFeedback,
+    placement::{ContactFeedback, PlaceFeedback},
+    target::Target,
+};
 use std::{
     io::{IsTerminal, stderr},
     time::Duration,
@@ -57,6 +61,28 @@ impl Observer for TerminalProgress {
         self.phase = name.into();
         self.bar.set_prefix(name.to_owned());
         self.bar.set_message("");
+    }
+
+    fn target(&mut self, target: &Target) {
+        let range_m = target.position_m.coords.xy().norm();
+        let [x, y, z] = target.sigma_mm();
+        self.line(&format!(
+            "target     {range_m:.2} m away, known to {x:.0} {y:.0} {z:.0} mm (one sigma)"
+        ));
+    }
+
+    fn approach(&mut self, feedback: &DriveToFeedback) {
+        let worst_mm = feedback.sigma_mm.iter().fold(0.0_f64, |a, b| a.max(*b));
+        let text = format!(
+            "{:<10} stop {:2}, {:5.2} m to target, known to {worst_mm:.1} mm",
+            format!("{:?}", feedback.activity).to_lowercase(),
+            feedback.stop_n,
+            feedback.range_m,
+        );
+        match feedback.score {
+            Some(score) => self.line(&format!("{text}, correlation {score:.2}")),
+            None => self.bar.set_message(text),
+        }
     }
 
     fn servo(&mut self, feedback: &PlaceFeedback) {

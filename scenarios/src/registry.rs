@@ -3,14 +3,22 @@
 use rover_bus::{Beat, CancelRequest, GoalRequest, Progress, ResultRequest};
 use rover_messages::{
     Fault, Nothing, Wire,
+    approach::{DriveToFeedback, DriveToGoal, DriveToResult},
     arm::{ArmState, ExecuteFeedback, ExecuteGoal, ExecuteResult},
     codec::{self, BINCODE, Format, MAX_PAYLOAD_BYTES},
-    imaging::{CaptureRequest, RawPair, StereoFrame},
+    imaging::{CaptureRequest, FrameReference, RawPair, StereoFrame},
+    mobility::{
+        DriveFeedback, DriveGoal, DriveResult, MastState, PointFeedback, PointGoal, PointResult,
+        WheelsState,
+    },
     placement::{
         ContactFeedback, ContactGoal, ContactResult, PlaceFeedback, PlaceGoal, PlaceResult,
     },
     planning::{Plan, PlanRequest, SurveyReport, SurveyRequest},
-    simulation::{InjectedFault, Score, ScoreRequest, TruthState, View, ViewRequest},
+    simulation::{
+        DesignateRequest, InjectedFault, Pick, PickRequest, Score, ScoreRequest, TruePlace,
+        TruthState, View, ViewRequest,
+    },
     status::{FaultReport, ServiceStatus},
     target::{SelectRequest, Target},
 };
@@ -75,6 +83,13 @@ impl Default for Registry {
             message::<PlanRequest>(),
             message::<SurveyReport>(),
             message::<SurveyRequest>(),
+            message::<FrameReference>(),
+            message::<MastState>(),
+            message::<WheelsState>(),
+            message::<DesignateRequest>(),
+            message::<Pick>(),
+            message::<PickRequest>(),
+            message::<TruePlace>(),
             message::<InjectedFault>(),
             message::<Score>(),
             message::<ScoreRequest>(),
@@ -91,6 +106,9 @@ impl Default for Registry {
         ];
         entries.extend(action::<ExecuteGoal, ExecuteFeedback, ExecuteResult>());
         entries.extend(action::<PlaceGoal, PlaceFeedback, PlaceResult>());
+        entries.extend(action::<PointGoal, PointFeedback, PointResult>());
+        entries.extend(action::<DriveGoal, DriveFeedback, DriveResult>());
+        entries.extend(action::<DriveToGoal, DriveToFeedback, DriveToResult>());
         entries.extend(action::<ContactGoal, ContactFeedback, ContactResult>());
         Self { entries }
     }

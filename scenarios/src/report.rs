@@ -2,6 +2,10 @@
 //!
 //! The field names are part of the product's interface. What a run did not come to is `null`.
 
+mod approach;
+
+pub use approach::{ApproachReport, ErrorSources, StopReport, Waypoints};
+
 use rover_messages::{
     Fault,
     codec::{NotFinite, check_finite},
@@ -52,6 +56,8 @@ pub struct RunReport {
     pub phases: Vec<Phase>,
     /// The selected target.
     pub target: Option<TargetReport>,
+    /// The way to the target, if the robot drove to it.
+    pub approach: Option<ApproachReport>,
     /// The way to the standoff, if it was reached.
     pub servo: Option<ServoReport>,
     /// The contact motion, if it ended by itself.
@@ -141,6 +147,8 @@ pub struct TruthReport {
     pub open_loop_lateral_error_mm: Option<f64>,
     /// Distance between believed and true tip, mm.
     pub arm_model_error_mm: f64,
+    /// The lateral error by source.
+    pub sources: ErrorSources,
 }
 
 impl From<&Target> for TargetReport {
@@ -196,14 +204,16 @@ impl From<&ContactResult> for ContactReport {
     }
 }
 
-impl From<&Score> for TruthReport {
-    fn from(s: &Score) -> Self {
+impl TruthReport {
+    /// From the simulator's score and the true places met on the way.
+    pub fn new(s: &Score, waypoints: &Waypoints) -> Self {
         Self {
             lateral_error_mm: s.lateral_error_mm,
             range_error_mm: s.range_error_mm,
             axis_error_deg: s.axis_error_deg,
             open_loop_lateral_error_mm: s.open_loop_lateral_error_mm,
             arm_model_error_mm: s.arm_model_error_mm,
+            sources: waypoints.sources(s),
         }
     }
 }
@@ -266,6 +276,9 @@ impl RunReport {
                 "target",
                 format!("{x:.4} {y:.4} {z:.4} m, plane rms {:.2} mm", t.plane_rms_mm),
             );
+        }
+        if let Some(approach) = &self.approach {
+            line("approach", approach.summary());
         }
         if let Some(s) = &self.servo {
             let found = s.fiducial_found.iter().filter(|f| **f).count();

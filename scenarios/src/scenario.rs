@@ -6,6 +6,7 @@
 
 mod documentation;
 mod overrides;
+mod target;
 mod variation;
 
 use crate::embedded;
@@ -14,13 +15,14 @@ use rover_messages::{
     target::Target,
 };
 use rover_robot::{Robot, RobotError};
-use rover_sim::{SimulationDescription, SimulationError, TargetPixel, World};
+use rover_sim::{SimulationDescription, SimulationError, World};
 use serde::{Deserialize, Serialize};
 use std::{
     path::{Path, PathBuf},
     sync::Arc,
     time::Duration,
 };
+pub use target::{ApproachSettings, PickChoice, TargetChoice};
 pub use variation::{CampaignSettings, Variation};
 
 /// One scenario.
@@ -39,6 +41,9 @@ pub struct Scenario {
     pub seed: u64,
     /// What to place the instrument on.
     pub target: TargetChoice,
+    /// How the rover gets there; absent where the target lies in the arm's workspace.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub approach: Option<ApproachSettings>,
     /// How the instrument is brought to the standoff.
     #[serde(default)]
     pub servo: ServoSettings,
@@ -57,16 +62,6 @@ pub struct Scenario {
     /// The world and the truth about the robot.
     #[serde(default)]
     pub simulation: SimulationDescription,
-}
-
-/// One pixel in one camera pair.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TargetChoice {
-    /// Camera pair, as named in the robot file.
-    pub pair: String,
-    /// Column and row in the left image, px; (0, 0) is the centre of the first pixel.
-    pub pixel_px: [f64; 2],
 }
 
 /// How the instrument is brought to the standoff.
@@ -308,10 +303,9 @@ impl LoadedScenario {
     /// [`SimulationError`] with the field, what was found and what was expected.
     pub fn world(&self) -> Result<World, SimulationError> {
         let mut description = self.scenario.simulation.clone();
-        description.target.get_or_insert_with(|| TargetPixel {
-            pair: self.scenario.target.pair.clone(),
-            pixel_px: self.scenario.target.pixel_px,
-        });
+        if description.target.is_none() {
+            description.target = self.scenario.target.known_from_the_start();
+        }
         let start_rad = self
             .robot
             .posture(&self.scenario.arm.start_posture)
@@ -404,13 +398,9 @@ impl Scenario {
                 i64::MAX
             ),
         )?;
-        let pair = robot
-            .pair(&self.target.pair)
-            .map_err(|e| check.error("target.pair", e.to_string()))?;
-        let size = [pair.cameras.left.width_px, pair.cameras.left.height_px];
-        for ((axis, &x), n) in ["u", "v"].iter().zip(&self.target.pixel_px).zip(size) {
-            let high = f64::from(n) - 0.5;
-            check.range(&format!("target.pixel_px ({axis})"), x, -0.5, high)?;
+        self.target.check(robot, &check)?;
+        if let Some(approach) = &self.approach {
+            approach.check(robot, &self.target, &check)?;
         }
         let s = &self.servo;
         check.require(
@@ -466,6 +456,17 @@ impl Scenario {
             check.range(field, value, 0.1, 86_400.0)?;
         }
         Ok(())
+    }
+
+    /// The approach's settings with the sun in them.
+    pub fn approach_under_the_sun(&self) -> Option<ApproachSettings> {
+        let mut settings = self.approach?;
+        settings.sun_deg.get_or_insert_with(|| {
+            let start = self.simulation.rover.unwrap_or_default();
+            let sun = &self.simulation.sun;
+            [sun.azimuth_deg - start.heading_deg, sun.elevation_deg]
+        });
+        Some(settings)
     }
 
     /// The servo's goal for a selected target.

@@ -4,7 +4,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use rover::report::{
-    ContactReport, Outcome, Phase, RunReport, ServoReport, TargetReport, TruthReport,
+    ContactReport, ErrorSources, Outcome, Phase, RunReport, ServoReport, TargetReport, TruthReport,
 };
 use serde_json::{Value, json};
 
@@ -30,6 +30,7 @@ fn report() -> RunReport {
             plane_rms_mm: 0.3,
             sigma_mm: [0.1, 0.1, 0.2],
         }),
+        approach: None,
         servo: Some(ServoReport {
             method: "epec_field".into(),
             iterations: 2,
@@ -50,6 +51,7 @@ fn report() -> RunReport {
             axis_error_deg: Some(0.7),
             open_loop_lateral_error_mm: Some(14.2),
             arm_model_error_mm: 17.1,
+            sources: ErrorSources::default(),
         }),
         digest: String::new(),
     }

@@ -41,6 +41,10 @@ pub struct DriveToGoal {
     /// Limits.
     #[serde(default)]
     pub limits: ApproachLimits,
+    /// Direction towards the sun, site frame, unit vector, if it is known: no base pose is chosen
+    /// from which the rover shades its target.
+    #[serde(default)]
+    pub sun_in_site: Option<[f64; 3]>,
     /// Radius about the target within which another spot may be taken if the target itself cannot
     /// be reached, m; 0 for the target alone.
     #[serde(default)]
@@ -73,6 +77,9 @@ pub struct DriveToFeedback {
     pub stop_n: u32,
     /// Believed distance of the target from the rover frame's origin along the ground, m.
     pub range_m: f64,
+    /// The last image in which the target was looked for, when it has just been found there.
+    #[serde(default)]
+    pub frame: Option<FrameReference>,
     /// Where the target is in the last left image, px, if it was found.
     pub pixel_px: Option<[f64; 2]>,
     /// Standard deviations of the target's position along the rover axes, mm.
@@ -164,6 +171,8 @@ pub struct DriveToResult {
     pub spot_offset_m: Option<[f64; 3]>,
     /// Error of the position by source.
     pub budget: Vec<ErrorShare>,
+    /// The target in the left image of the pair that tracked it, as it was handed over, px.
+    pub tracked_px: [f64; 2],
     /// Distance between the pixel predicted by geometry alone and the matched one at the
     /// handover, px.
     pub handover_px: f64,
@@ -175,10 +184,10 @@ pub struct DriveToResult {
     pub driven_m: f64,
 }
 
-wire! { DriveToFeedback = "drive_to_feedback/1" }
+wire! { DriveToFeedback = "drive_to_feedback/2" }
 
 impl Wire for DriveToGoal {
-    const SCHEMA: &'static str = "drive_to_goal/1";
+    const SCHEMA: &'static str = "drive_to_goal/2";
     fn validate(&self) -> Result<(), String> {
         self.target.validate().map_err(|e| format!("target.{e}"))?;
         if self.anchor.pair != self.target.pair {
@@ -199,14 +208,19 @@ impl Wire for DriveToGoal {
                 in_range(field, value, low, high)?;
             }
         }
+        if let Some(sun) = &self.sun_in_site {
+            let length = sun.iter().map(|x| x * x).sum::<f64>().sqrt();
+            in_range("sun_in_site (length)", length, 1.0 - 1e-6, 1.0 + 1e-6)?;
+        }
         in_range("spot_radius_m", self.spot_radius_m, 0.0, 1.0)
     }
 }
 
 impl Wire for DriveToResult {
-    const SCHEMA: &'static str = "drive_to_result/1";
+    const SCHEMA: &'static str = "drive_to_result/2";
     fn validate(&self) -> Result<(), String> {
         self.target.validate().map_err(|e| format!("target.{e}"))?;
+        finite("tracked_px", &self.tracked_px)?;
         finite("handover_px", &[self.handover_px, self.driven_m])?;
         for (i, share) in self.budget.iter().enumerate() {
             in_range(&format!("budget[{i}].sigma_mm"), share.sigma_mm, 0.0, 1e4)?;

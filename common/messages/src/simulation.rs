@@ -29,6 +29,9 @@ pub struct Score {
     pub target_in_world_m: [f64; 3],
     /// True surface normal there.
     pub normal_in_world: [f64; 3],
+    /// The believed target (as it was handed over, if it was), world frame, camera mount error
+    /// removed, m.
+    pub believed_in_world_m: [f64; 3],
     /// First touch of the instrument on the terrain, world frame, m.
     pub contact_in_world_m: Option<[f64; 3]>,
     /// Distance between the two in the plane of the true normal, mm.
@@ -200,7 +203,7 @@ pub enum InjectedFault {
 
 wire! {
     ScoreRequest = "score_request/2",
-    Score = "score/1",
+    Score = "score/2",
     ViewRequest = "view_request/1",
     View = "view/1",
     TruthState = "truth_state/2",

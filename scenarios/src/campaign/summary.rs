@@ -305,6 +305,7 @@ mod tests {
             reason: Some("no_texture: too plain".into()),
             phases: vec![],
             target: None,
+            approach: None,
             servo: None,
             contact: None,
             truth: None,

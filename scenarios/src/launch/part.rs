@@ -24,6 +24,7 @@ pub async fn serve_service(
     let running = match name {
         service::MAST_IMAGING => rover_mast_imaging::serve(peer, robot).await,
         service::TARGET_SELECTION => rover_target_selection::serve(peer, robot).await,
+        service::ROVER_APPROACH => rover_approach::service::serve(peer, robot).await,
         service::ARM_PLANNER => rover_arm_planner::serve(peer, robot).await,
         service::EPEC_SERVO => rover_epec_servo::serve(peer, robot).await,
         service::CONTACT_APPROACH => rover_contact_approach::serve(peer, robot).await,

@@ -15,6 +15,50 @@ const FIELDS: &[(&str, &str)] = &[
         "target.pixel_px",
         "Column and row in the left image, px; (0, 0) is the centre of the first pixel.",
     ),
+    (
+        "target.mast_deg",
+        "Pan (to the left) and tilt (down) of the mast for that image, deg; for a pair on the mast.",
+    ),
+    (
+        "target.pick",
+        "Instead of a pixel: the place that the simulator picks in a person's stead.",
+    ),
+    ("target.pick.surface", "\"rock\" or \"ground\"."),
+    (
+        "target.pick.range_m",
+        "Nearest and farthest distance from the rover along the ground, m.",
+    ),
+    ("target.pick.choice_n", "Which of many such places."),
+    (
+        "approach",
+        "How the rover drives to a target seen from the mast; without it the target lies in the arm's workspace.",
+    ),
+    ("approach.max_distance_m", "Longest way of the wheels, m."),
+    ("approach.max_stops_n", "Most stops."),
+    (
+        "approach.step_fraction",
+        "Longest way between two stops, as a fraction of the range.",
+    ),
+    (
+        "approach.max_slope_deg",
+        "Steepest ground to drive on, deg.",
+    ),
+    (
+        "approach.max_slip",
+        "Largest slip, fraction of the wheels' way.",
+    ),
+    (
+        "approach.max_sigma_mm",
+        "Near the target: largest uncertainty of its position at which to go on, mm, one sigma.",
+    ),
+    (
+        "approach.sun_deg",
+        "Azimuth (from the rover's first heading to its left) and elevation of the sun, deg; without it those of the simulated sun.",
+    ),
+    (
+        "approach.spot_radius_mm",
+        "Another spot within this radius may be taken if the target itself cannot be reached, mm; 0 for the target alone.",
+    ),
     ("servo", "How the instrument is brought to the standoff."),
     (
         "servo.method",
@@ -77,7 +121,7 @@ const FIELDS: &[(&str, &str)] = &[
     ("campaign", "What differs from run to run of a campaign."),
     (
         "campaign.vary",
-        "Fields that are drawn from the seed: { path, uniform = [low, high] | choice = [..] | cycle = [..] }.",
+        "Fields that are drawn from the seed: { path, uniform = [low, high] | integer = [low, high] | choice = [..] | cycle = [..] }.",
     ),
 ];
 
@@ -113,32 +157,40 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
     use crate::{embedded, scenario::Scenario};
+    use std::collections::BTreeSet;
+
+    /// Paths of all fields of tables within tables, but for the simulation's.
+    fn paths(table: &toml::Table, before: &str, found: &mut BTreeSet<String>) {
+        for (key, value) in table {
+            let path = format!("{before}{key}");
+            if path == "simulation" {
+                continue;
+            }
+            if let toml::Value::Table(fields) = value {
+                paths(fields, &format!("{path}."), found);
+            }
+            found.insert(path);
+        }
+    }
 
     #[test]
     fn every_field_of_the_runner_is_explained_and_every_explanation_has_a_field() {
-        let (name, text) = embedded::find(embedded::SCENARIOS, embedded::DEFAULT_SCENARIO).unwrap();
-        let table = toml::Table::try_from(Scenario::parse(text, name).unwrap()).unwrap();
-        let mut paths = Vec::new();
-        for (key, value) in table {
-            if key == "simulation" {
-                continue;
-            }
-            paths.push(key.clone());
-            if let toml::Value::Table(fields) = value {
-                paths.extend(fields.keys().map(|field| format!("{key}.{field}")));
-            }
+        let by_hand = "name = 'a'\nrobot = 'b'\n[target]\npair = 'mast'\npixel_px = [1.0, 2.0]\n\
+                       mast_deg = [0.0, 10.0]\n[approach]\nsun_deg = [90.0, 45.0]";
+        let mut found = BTreeSet::new();
+        let shipped = embedded::SCENARIOS.iter().map(|(_, text)| *text);
+        for text in shipped.chain([by_hand]) {
+            let scenario = Scenario::parse(text, "a scenario").unwrap();
+            paths(&toml::Table::try_from(scenario).unwrap(), "", &mut found);
         }
-        for path in &paths {
+        for path in &found {
             assert!(
                 FIELDS.iter().any(|(field, _)| field == path),
                 "{path} is not explained"
             );
         }
         for (field, _) in FIELDS.iter().filter(|(f, _)| !f.starts_with("simulation")) {
-            assert!(
-                paths.iter().any(|path| path == field),
-                "{field} is explained but is none"
-            );
+            assert!(found.contains(*field), "{field} is explained but is none");
         }
     }
 }

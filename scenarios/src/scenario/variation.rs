@@ -14,7 +14,7 @@ pub struct CampaignSettings {
     pub vary: Vec<Variation>,
 }
 
-/// One field and what it may become; exactly one of `uniform`, `choice` and `cycle`.
+/// One field and what it may become; exactly one of `uniform`, `integer`, `choice` and `cycle`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Variation {
@@ -23,6 +23,9 @@ pub struct Variation {
     /// Drawn evenly between these bounds, in the field's unit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub uniform: Option<[f64; 2]>,
+    /// A whole number drawn evenly between these, both included.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub integer: Option<[i64; 2]>,
     /// Drawn from these values.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub choice: Option<Vec<toml::Value>>,
@@ -42,17 +45,24 @@ impl Variation {
             let index = n.checked_rem(count).ok_or("no values, expected some")?;
             Ok(values[index as usize].clone())
         };
-        match (&self.uniform, &self.choice, &self.cycle) {
-            (Some([low, high]), None, None) => {
+        match (&self.uniform, &self.integer, &self.choice, &self.cycle) {
+            (Some([low, high]), None, None, None) => {
                 if !(low < high && low.is_finite() && high.is_finite()) {
                     return Err(format!("uniform = [{low}, {high}], expected low < high"));
                 }
                 let x: f64 = self.stream(seed).random();
                 Ok(toml::Value::Float(low + (high - low) * x))
             }
-            (None, Some(values), None) => one_of(values, self.stream(seed).random()),
-            (None, None, Some(values)) => one_of(values, seed),
-            _ => Err("expected exactly one of uniform, choice, cycle".into()),
+            (None, Some([low, high]), None, None) => {
+                if low > high {
+                    return Err(format!("integer = [{low}, {high}], expected low <= high"));
+                }
+                let n = self.stream(seed).random_range(*low..=*high);
+                Ok(toml::Value::Integer(n))
+            }
+            (None, None, Some(values), None) => one_of(values, self.stream(seed).random()),
+            (None, None, None, Some(values)) => one_of(values, seed),
+            _ => Err("expected exactly one of uniform, integer, choice, cycle".into()),
         }
     }
 
@@ -108,6 +118,18 @@ mod tests {
     }
 
     #[test]
+    fn whole_numbers_stay_whole_and_reach_both_ends() {
+        let seeds = variation("path = 'a'\ninteger = [3, 5]");
+        let values: Vec<i64> = (0..200)
+            .map(|seed| seeds.draw(seed).unwrap().as_integer().unwrap())
+            .collect();
+        for n in 3..=5 {
+            assert!(values.contains(&n), "{n}");
+        }
+        assert!(values.iter().all(|n| (3..=5).contains(n)));
+    }
+
+    #[test]
     fn a_cycle_gives_each_value_its_turn_and_a_choice_each_its_chance() {
         let cycle = variation("path = 'a'\ncycle = ['x', 'y']");
         let of = |v: &Variation, n| v.draw(n).unwrap().as_str().unwrap().to_owned();
@@ -126,6 +148,7 @@ mod tests {
             "path = 'a'",
             "path = 'a'\nuniform = [2.0, 1.0]",
             "path = 'a'\nchoice = []",
+            "path = 'a'\ninteger = [2, 1]",
             "path = 'a'\nuniform = [1.0, 2.0]\ncycle = [1]",
         ] {
             assert!(variation(text).draw(1).is_err(), "{text}");

@@ -7,6 +7,7 @@
 //! wheels and the limits of the ground.
 
 use crate::obstacles::{GroundMap, PlanarPose, Standing};
+use crate::shade::Shade;
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector2, Vector3};
 use rover_cameras::StereoPair;
 use rover_kinematics::{AxisGoal, solve_axis};
@@ -36,6 +37,8 @@ pub struct BaseRules {
     pub min_limit_rad: f64,
     /// Steepest ground to work on, rad.
     pub max_slope_rad: f64,
+    /// Distance of the target from the rover's own shadow, m.
+    pub shade_margin_m: f64,
 }
 
 impl Default for BaseRules {
@@ -44,13 +47,14 @@ impl Default for BaseRules {
             ahead_m: [0.80, 1.30],
             aside_m: 0.25,
             step_m: 0.05,
-            heading_rad: [0.5, 0.125],
+            heading_rad: [1.0, 0.125],
             standoff_m: 0.08,
             border_px: 30.0,
             max_facing_rad: 1.13,
             min_manipulability: 0.05,
             min_limit_rad: 0.05,
             max_slope_rad: 0.26,
+            shade_margin_m: 0.06,
         }
     }
 }
@@ -72,7 +76,10 @@ pub struct Serving {
     pub limit_rad: f64,
     /// Angle between the fiducial's normal and the direction to the cameras at the standoff, rad.
     pub facing_rad: f64,
-    /// The sum that candidates are ranked by; more is better.
+    /// How well the arm works there; more is better.
+    pub arm_score: f64,
+    /// The sum that candidates are ranked by: the arm's, the ground's and the way's; more is
+    /// better.
     pub score: f64,
 }
 
@@ -115,6 +122,9 @@ pub struct BaseTask<'a> {
     pub body: &'a CameraPairDescription,
     /// How to choose.
     pub rules: &'a BaseRules,
+    /// What casts shadows, and the unit vector towards the sun in the frame of the target, if it
+    /// is known.
+    pub sun: Option<(&'a Shade, Vector3<f64>)>,
 }
 
 /// The target in some rover frame.
@@ -201,6 +211,9 @@ impl BaseTask<'_> {
             position_m: (there * Point3::from(target.position_m)).coords,
             normal: there.rotation * target.normal,
         };
+        if self.shades(&spot, &there.rotation) {
+            return Err("own_shadow".into());
+        }
         let mut found = self.serve(&spot)?;
         let room = 1.0 - standing.slope_rad / self.rules.max_slope_rad;
         let way = Vector2::new(pose.x_m, pose.y_m).norm() + 0.5 * pose.heading_rad.abs();
@@ -272,11 +285,21 @@ impl BaseTask<'_> {
                     manipulability,
                     limit_rad,
                     facing_rad,
+                    arm_score: score,
                     score,
                 });
             }
         }
         best.ok_or_else(|| reason.to_string())
+    }
+
+    /// Whether the rover shades the target `spot` (frame of the rover that stands there, turned
+    /// by `there_from_here` against that of the sun).
+    pub fn shades(&self, spot: &TargetSpot, there_from_here: &UnitQuaternion<f64>) -> bool {
+        self.sun.as_ref().is_some_and(|(shade, sun)| {
+            let sun = there_from_here * sun;
+            shade.covers(&spot.position_m, &sun, self.rules.shade_margin_m)
+        })
     }
 
     fn sees(&self, pair: &StereoPair, point: &Vector3<f64>) -> bool {
@@ -364,6 +387,7 @@ mod tests {
             mobility: robot.mobility().unwrap(),
             body: robot.pair("body").unwrap(),
             rules: &BaseRules::default(),
+            sun: None,
         };
         let spot = TargetSpot {
             position_m: target.into(),

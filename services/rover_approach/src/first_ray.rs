@@ -10,10 +10,10 @@
 use crate::align::{Aligned, Freedom, Template};
 use crate::error::TrackError;
 use crate::patch::{HalfSize, Patch};
-use crate::surface::PlaneRules;
+use crate::surface::{PlaneRules, SurfacePlane};
 use crate::track::Tracker;
 use crate::view::View;
-use crate::warp::{PlaneWarp, SurfacePlane};
+use crate::warp::PlaneWarp;
 use nalgebra::{Matrix2, Point3, Vector2, Vector3};
 use rover_cameras::Camera;
 use rover_vision::match_point;

@@ -52,6 +52,24 @@ impl Default for HandoverRules {
     }
 }
 
+impl HandoverRules {
+    /// The rules for a robot whose two pairs are mounted with an uncertainty of `mount_rad`
+    /// each (one sigma per axis), seen by a camera of `focal_px`: geometry alone is off by that,
+    /// so the search must reach so far and the gate may not be closer.
+    #[must_use]
+    pub fn for_mounts(mount_rad: f64, focal_px: f64) -> Self {
+        /// Three sigma of two mounts.
+        const SIGMAS: f64 = 3.0 * std::f64::consts::SQRT_2;
+        let rules = Self::default();
+        let reach_px = SIGMAS * mount_rad * focal_px;
+        Self {
+            search_px: rules.search_px.hypot(reach_px),
+            gate_px: rules.gate_px.hypot(reach_px),
+            ..rules
+        }
+    }
+}
+
 /// The target in the body pair.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Handover {

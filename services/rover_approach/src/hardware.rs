@@ -5,6 +5,7 @@ use rover_bus::{BusError, GoalContext, Peer};
 use rover_messages::{
     Fault, Wire,
     approach::DriveToFeedback,
+    arm::ArmState,
     imaging::{CaptureRequest, FrameReference, StereoFrame},
     keys::{self, service::ROVER_APPROACH},
     mobility::{
@@ -70,6 +71,16 @@ impl Hardware<'_> {
             .await
             .map_err(|e| e.into_fault(ROVER_APPROACH))?;
         ready(frame, exposure_n)
+    }
+
+    /// Where the arm is, rad.
+    pub async fn joints_rad(&self) -> Result<Vec<f64>, Fault> {
+        let state: ArmState = self
+            .peer
+            .latest(keys::ARM_STATE, ANSWER_LIMIT)
+            .await
+            .map_err(|e| e.into_fault(ROVER_APPROACH))?;
+        Ok(state.joints_rad)
     }
 
     /// One of the last frames again.

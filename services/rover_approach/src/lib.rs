@@ -4,7 +4,7 @@
 //! The algorithm files know no bus and no clock. `track` finds the target again in each new image
 //! (`warp`, `patch`, `align`, `surface`, `relief`), `filter` carries its position, `first_ray` meets
 //! the ray first designated with the near map, `handover` goes over to the body pair; `obstacles`
-//! and `drive` find the way, `base_pose` the place to stand. `service` puts them on the bus; without the feature
+//! and `drive` find the way, `base_pose` the place to stand, out of the rover's own shadow (`shade`). `service` puts them on the bus; without the feature
 //! `bus` the algorithms build alone.
 
 // `!(x >= limit)` refuses a NaN as well, which `x < limit` would let through
@@ -28,6 +28,7 @@ mod report;
 pub mod service;
 #[cfg(feature = "bus")]
 mod session;
+pub mod shade;
 pub mod surface;
 pub mod track;
 pub mod view;

@@ -6,9 +6,9 @@
 //! the anchor image twice, at its own range and at the plane's, and the hit moves to where the
 //! corrected re-projection is the anchor pixel.
 
-use crate::surface::PlaneRules;
+use crate::surface::{PlaneRules, SurfacePlane};
 use crate::view::View;
-use crate::warp::{PlaneWarp, SurfacePlane};
+use crate::warp::PlaneWarp;
 use nalgebra::{Isometry3, Matrix3, Point3, Vector2, Vector3};
 use rover_cameras::Camera;
 use rover_vision::match_point;

@@ -9,14 +9,16 @@ use crate::hardware::{Frame, Hardware, fault};
 use crate::obstacles::{GroundMap, GroundRules};
 use crate::report::{Budget, sighting, sigma_mm};
 use crate::service::unfit;
+use crate::shade::Shade;
 use crate::surface::measure_plane;
-use crate::track::{Fix, TrackRules, Tracker};
+use crate::track::{Fix, Refusal, TrackRules, Tracker};
 use nalgebra::{Isometry3, Matrix3, Point3, UnitQuaternion, Vector2, Vector3};
 use rover_geometry::{Point, tangent_basis};
 use rover_messages::{
     Fault,
     approach::{
         ApproachActivity, ApproachStop, BasePose, DriveToFeedback, DriveToGoal, DriveToResult,
+        Sighting,
     },
     mobility::{DriveArc, DriveResult, WheelsState},
     target::Target,
@@ -39,6 +41,12 @@ const MAP_FRAMES: usize = 6;
 const MAX_STOPS_N: u32 = 60;
 /// Close enough to the chosen base pose: m, rad.
 const ARRIVED: (f64, f64) = (0.06, 0.08);
+/// Stops in a row at which the target may be missed.
+const MISSES_N: u32 = 1;
+/// Largest uncertainty with which a missed target is carried on by odometry, mm, one sigma.
+const MISSED_SIGMA_MM: f64 = 120.0;
+/// A pose in which the arm works worse than in the best by no more than this is not left.
+const GOOD_ENOUGH: f64 = 0.15;
 /// Movements near the target after which any pose that serves is taken.
 const PATIENCE_N: u32 = 10;
 
@@ -60,6 +68,9 @@ pub(crate) struct Session<'a> {
     driven_m: f64,
     spot_offset_m: Option<Vector3<f64>>,
     near_moves_n: u32,
+    shade: Shade,
+    /// Stops in a row at which the target was not found.
+    missed_n: u32,
 }
 
 impl<'a> Session<'a> {
@@ -74,6 +85,7 @@ impl<'a> Session<'a> {
         let pair = robot.pair(&goal.target.pair).map_err(|e| unfit(&e))?;
         let now = hardware.recall(&goal.anchor).await?;
         let wheels = wheels_of(&now)?;
+        let stowed_rad = hardware.joints_rad().await?;
         let pixel = Vector2::from(goal.target.pixel_px);
         let tracker = Tracker::designate(
             Arc::clone(&now.view),
@@ -110,6 +122,8 @@ impl<'a> Session<'a> {
             driven_m: 0.0,
             spot_offset_m: None,
             near_moves_n: 0,
+            shade: Shade::of(robot, &stowed_rad),
+            missed_n: 0,
         };
         session.approach().await
     }
@@ -118,7 +132,7 @@ impl<'a> Session<'a> {
         self.remember_ground();
         loop {
             let range_m = self.estimate.position_m.xy().norm();
-            self.tell(ApproachActivity::Planning, None, None);
+            self.tell(ApproachActivity::Planning);
             self.look_ahead().await?;
             let arc = if range_m > NEAR_M {
                 self.far_movement(range_m)?
@@ -134,7 +148,7 @@ impl<'a> Session<'a> {
             if self.stops.len() as u32 >= limit {
                 return Err(fault("too_many_stops", format!("{limit} stops made")));
             }
-            self.tell(ApproachActivity::Driving, None, None);
+            self.tell(ApproachActivity::Driving);
             let done = self.hardware.drive(arc, self.goal.limits.max_slip).await?;
             self.after_drive(&done, range_m <= NEAR_M).await?;
         }
@@ -164,17 +178,26 @@ impl<'a> Session<'a> {
         };
         let body = self.robot.pair("body").map_err(|e| unfit(&e))?;
         let base_rules = BaseRules::default();
+        let level = self.level_from_rover();
         let task = BaseTask {
             robot: self.robot,
             mobility: self.mobility,
             body,
             rules: &base_rules,
+            sun: self.sun_in_level().map(|sun| (&self.shade, sun)),
         };
-        let here = task.serve(&spot);
+        let here = if task.shades(&spot, &level.rotation.inverse()) {
+            Err("own_shadow".to_string())
+        } else {
+            task.serve(&spot)
+        };
+        let best_arm = choice.serving.iter().map(|s| s.arm_score);
+        let best_arm = best_arm.fold(f64::NEG_INFINITY, f64::max);
         if let (Ok(serving), Some(best)) = (&here, choice.serving.first()) {
             let away = Vector2::new(best.pose.x_m, best.pose.y_m).norm();
-            let arrived = away <= ARRIVED.0 && best.pose.heading_rad.abs() <= ARRIVED.1;
-            if arrived || self.near_moves_n >= PATIENCE_N {
+            let arrived = away <= ARRIVED.0 && best.pose.heading_rad.abs() <= ARRIVED.1
+                || serving.arm_score >= best_arm - GOOD_ENOUGH;
+            if self.missed_n == 0 && (arrived || self.near_moves_n >= PATIENCE_N) {
                 return Ok(NearStep::Stay(serving.clone(), choice));
             }
         }
@@ -206,6 +229,7 @@ impl<'a> Session<'a> {
             mobility: self.mobility,
             body,
             rules: &rules,
+            sun: self.sun_in_level().map(|sun| (&self.shade, sun)),
         };
         let level = self.level_from_rover();
         let levelled = TargetSpot {
@@ -346,8 +370,7 @@ impl<'a> Session<'a> {
             let fix = match found {
                 Ok(fix) => fix,
                 Err(refusal) if exposure_n > 0 => {
-                    let range_m = self.estimate.position_m.xy().norm();
-                    return Err(fault("target_lost", refusal.to_string()).with("range_m", range_m));
+                    return self.missed(motion, sightings, frame, wheels, &refusal);
                 }
                 Err(_) => continue,
             };
@@ -365,7 +388,41 @@ impl<'a> Session<'a> {
         Err(fault("target_lost", "no image was accepted"))
     }
 
-    fn record(&mut self, sightings: Vec<rover_messages::approach::Sighting>, fix: &Fix) {
+    /// The target was not found in either image of a stop. While the position is still known well
+    /// enough to search for it again, odometry carries it one stop further: a passing shadow or a
+    /// blur of one place is no reason to give up, and the next stop must find the target.
+    fn missed(
+        &mut self,
+        motion: &Motion,
+        sightings: Vec<Sighting>,
+        frame: Frame,
+        wheels: WheelsState,
+        refusal: &Refusal,
+    ) -> Result<(), Fault> {
+        self.missed_n += 1;
+        let range_m = self.estimate.position_m.xy().norm();
+        let worst_mm = sigma_mm(&self.estimate.covariance_m2)
+            .iter()
+            .fold(0.0_f64, |m, s| m.max(*s));
+        if self.missed_n > MISSES_N || worst_mm > MISSED_SIGMA_MM {
+            return Err(fault("target_lost", refusal.to_string())
+                .with("range_m", range_m)
+                .with("sigma_mm", worst_mm));
+        }
+        self.tracker.coast(&motion.now_from_last);
+        (self.now, self.wheels) = (frame, wheels);
+        self.remember_ground();
+        self.note_stop(sightings);
+        Ok(())
+    }
+
+    fn record(&mut self, sightings: Vec<Sighting>, fix: &Fix) {
+        self.missed_n = 0;
+        self.note_stop(sightings);
+        self.tell_sighting(fix.pixel_px.into(), fix.score);
+    }
+
+    fn note_stop(&mut self, sightings: Vec<Sighting>) {
         let stop_n = self.stops.len() as u32 + 1;
         self.stops.push(ApproachStop {
             stop_n,
@@ -377,12 +434,6 @@ impl<'a> Session<'a> {
             sigma_mm: sigma_mm(&self.estimate.covariance_m2),
             slip: self.wheels.slip,
         });
-        let pixel = fix.pixel_px;
-        self.tell(
-            ApproachActivity::Tracking,
-            Some(pixel.into()),
-            Some(fix.score),
-        );
     }
 
     /// First ray, hand-over, and the target as the body pair sees it.
@@ -391,7 +442,7 @@ impl<'a> Session<'a> {
         serving: Serving,
         choice: BaseChoice,
     ) -> Result<DriveToResult, Fault> {
-        self.tell(ApproachActivity::HandingOver, None, None);
+        self.tell(ApproachActivity::HandingOver);
         let view = Arc::clone(&self.now.view);
         if self.spot_offset_m.is_none()
             && let Ok(met) = first_ray(&self.tracker, &view, &FirstRayRules::default())
@@ -402,9 +453,17 @@ impl<'a> Session<'a> {
         }
         let body = self.hardware.capture("body", 0).await?;
         let (pixel, surface) = self.tracker.target();
-        let found = hand_over(&view, pixel, surface, &body.view, &HandoverRules::default())
-            .map_err(|e| fault("handover_failed", e.to_string()))?;
+        let tracked_px: [f64; 2] = (*pixel).into();
         let focal_px = body.view.cameras.left.model.cahv()[2].norm();
+        let mount_rad = self
+            .robot
+            .description()
+            .model_quality
+            .angle_deg
+            .to_radians();
+        let rules = HandoverRules::for_mounts(mount_rad, focal_px);
+        let found = hand_over(&view, pixel, surface, &body.view, &rules)
+            .map_err(|e| fault("handover_failed", e.to_string()))?;
         self.budget.handed(&found, focal_px);
         let mut target = self.acceptable(&found.pixel_px, &found.surface).await?;
         let lateral = self.budget.lateral_m();
@@ -428,6 +487,7 @@ impl<'a> Session<'a> {
             target,
             spot_offset_m: self.spot_offset_m.map(Into::into),
             budget: self.budget.shares(),
+            tracked_px,
             handover_px: (found.pixel_px - found.geometric_px).norm(),
             base: BasePose {
                 pose: self.wheels.pose,
@@ -496,7 +556,7 @@ impl<'a> Session<'a> {
     /// Looks at the ground that the next movement leads over, unless the target's own image shows
     /// it.
     async fn look_ahead(&mut self) -> Result<(), Fault> {
-        self.tell(ApproachActivity::Looking, None, None);
+        self.tell(ApproachActivity::Looking);
         let bearing = self.estimate.position_m.xy().normalize();
         let range_m = self.estimate.position_m.xy().norm();
         if range_m < HAZARD_LOOK_M {
@@ -558,15 +618,38 @@ impl<'a> Session<'a> {
         UnitQuaternion::from_euler_angles(pose.roll_rad, pose.pitch_rad, 0.0).into_isometry()
     }
 
-    fn tell(&self, activity: ApproachActivity, pixel_px: Option<[f64; 2]>, score: Option<f64>) {
+    /// Unit vector towards the sun in the levelled rover frame, if it is known and above the
+    /// horizon.
+    fn sun_in_level(&self) -> Option<Vector3<f64>> {
+        let sun = Vector3::from(self.goal.sun_in_site?);
+        let turn = UnitQuaternion::from_euler_angles(0.0, 0.0, -self.wheels.pose.heading_rad);
+        (sun.z > 0.0).then(|| turn * sun)
+    }
+
+    fn tell(&self, activity: ApproachActivity) {
+        self.hardware.context.feedback(self.feedback(activity));
+    }
+
+    /// The target was found in the present image.
+    fn tell_sighting(&self, pixel_px: [f64; 2], score: f64) {
         self.hardware.context.feedback(DriveToFeedback {
+            frame: Some(self.now.reference.clone()),
+            pixel_px: Some(pixel_px),
+            score: Some(score),
+            ..self.feedback(ApproachActivity::Tracking)
+        });
+    }
+
+    fn feedback(&self, activity: ApproachActivity) -> DriveToFeedback {
+        DriveToFeedback {
             activity,
             stop_n: self.stops.len() as u32,
             range_m: self.estimate.position_m.xy().norm(),
-            pixel_px,
+            frame: None,
+            pixel_px: None,
             sigma_mm: sigma_mm(&self.estimate.covariance_m2),
-            score,
-        });
+            score: None,
+        }
     }
 }
 

@@ -9,9 +9,9 @@ use crate::align::{AlignRules, Freedom, Template, refine, search};
 use crate::error::TrackError;
 use crate::patch::HalfSize;
 use crate::relief::{AnchorGeometry, ReliefRules, corrected_pixel};
-use crate::surface::{PlaneRules, StereoPlane, measure_plane};
+use crate::surface::{PlaneRules, StereoPlane, SurfacePlane, measure_plane};
 use crate::view::View;
-use crate::warp::{PlaneWarp, SurfacePlane};
+use crate::warp::PlaneWarp;
 use nalgebra::{Isometry3, Matrix2, Vector2};
 use std::sync::Arc;
 
@@ -455,6 +455,19 @@ impl Tracker {
             anchored,
             relief_px,
         }
+    }
+
+    /// Carries the target along by odometry alone, where it could not be found.
+    pub fn coast(&mut self, now_from_last: &Isometry3<f64>) {
+        let carry = |anchor: &mut Anchor| {
+            anchor.anchor_from_rover *= now_from_last.inverse();
+            anchor.warp = anchor.warp.moved(now_from_last);
+        };
+        carry(&mut self.first);
+        self.anchors.iter_mut().for_each(carry);
+        self.surface.plane = self.surface.plane.moved(now_from_last);
+        let turn = now_from_last.rotation.to_rotation_matrix();
+        self.surface.covariance_m2 = turn * self.surface.covariance_m2 * turn.transpose();
     }
 
     /// The hit after the relief correction against anchor `index`, with the surface there.

@@ -14,28 +14,9 @@
 //! are seen. So the matrix is the chain of all accepted warps, without loss. With a distorting lens
 //! `b(d)` is its tangent at the anchor pixel; projection into the other image uses the full model.
 
+use crate::surface::SurfacePlane;
 use nalgebra::{Isometry3, Matrix2, Matrix3, Matrix4x3, UnitQuaternion, Vector2, Vector3};
 use rover_cameras::Camera;
-
-/// A plane in the rover frame of one stop.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SurfacePlane {
-    /// A point of it, m.
-    pub point: Vector3<f64>,
-    /// Unit normal, towards the camera.
-    pub normal: Vector3<f64>,
-}
-
-impl SurfacePlane {
-    /// The plane in another frame.
-    #[must_use]
-    pub fn moved(&self, to_from: &Isometry3<f64>) -> Self {
-        Self {
-            point: to_from * nalgebra::Point3::from(self.point) - nalgebra::Point3::origin(),
-            normal: to_from.rotation * self.normal,
-        }
-    }
-}
 
 /// Where the pixels of a template lie in space; see the module's text.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -8,7 +8,7 @@
 mod select;
 mod service;
 
-pub use select::{STANDOFF_M, TRAVEL_BEYOND_M, check_pixel, check_reach, target_at};
+pub use select::{STANDOFF_M, TRAVEL_BEYOND_M, check_pixel, check_reach, is_distant, target_at};
 pub use service::serve;
 
 /// Name under which the service raises its faults.

@@ -9,9 +9,12 @@ use rover_messages::{
     imaging::StereoFrame,
     target::{SelectRequest, Target},
 };
-use rover_robot::{CameraPairDescription, Robot};
+use rover_robot::{CameraMount, CameraPairDescription, Robot};
 use rover_service::{frames::prepared, reach_refusal};
-use rover_vision::{MatchRules, Surface, SurfaceFailure, SurfaceRules, measure_surface};
+use rover_vision::{
+    MatchRules, PlaneRules, Surface, SurfaceFailure, SurfaceRules, measure_distant_surface,
+    measure_surface,
+};
 
 /// Distance from the surface along its normal from which the arm must be able to approach, m.
 pub const STANDOFF_M: f64 = 0.05;
@@ -50,6 +53,13 @@ pub fn check_pixel(pixel_px: [f64; 2], pair: &CameraPairDescription) -> Result<(
     .with("height_px", height.into()))
 }
 
+/// Whether the pair looks at what the rover still has to drive to: it is on the mast. Whether such
+/// a surface suits the instrument, and whether the arm reaches it, shows only from near.
+#[must_use]
+pub fn is_distant(pair: &CameraPairDescription) -> bool {
+    pair.mount == CameraMount::Mast
+}
+
 /// The target at the request's pixel of `frame`, rover frame.
 ///
 /// # Errors
@@ -63,17 +73,24 @@ pub fn target_at(
 ) -> Result<Target, Fault> {
     check_pixel(request.pixel_px, pair)?;
     let (left, right) = prepared(SERVICE, frame)?;
-    let rules = SurfaceRules {
-        matching: MatchRules {
-            range_min_m: pair.range_min_m,
-            range_max_m: pair.range_max_m,
-            ..Default::default()
-        },
-        ..Default::default()
-    };
     let pixel = Vector2::from(request.pixel_px);
-    let surface = measure_surface(&left, &right, &frame.cameras, &pixel, &rules)
-        .map_err(|failure| refused(&failure, request))?;
+    let surface = if is_distant(pair) {
+        let range_m = [pair.range_min_m, pair.range_max_m];
+        let images = (&left, &right);
+        let rules = PlaneRules::default();
+        measure_distant_surface(images, &frame.cameras, &pixel, range_m, &rules)
+    } else {
+        let rules = SurfaceRules {
+            matching: MatchRules {
+                range_min_m: pair.range_min_m,
+                range_max_m: pair.range_max_m,
+                ..Default::default()
+            },
+            ..Default::default()
+        };
+        measure_surface(&left, &right, &frame.cameras, &pixel, &rules)
+    }
+    .map_err(|failure| refused(&failure, request))?;
     target(request, frame, &surface)
 }
 

@@ -1,6 +1,6 @@
 //! Target selection on the network: `target/select` and `target/current`.
 
-use crate::{SERVICE, check_pixel, check_reach, target_at};
+use crate::{SERVICE, check_pixel, check_reach, is_distant, target_at};
 use rover_bus::{BusError, Peer, Stream};
 use rover_messages::{
     Fault, keys,
@@ -63,7 +63,9 @@ impl Desk {
         let robot = self.robot.clone();
         tokio::task::spawn_blocking(move || {
             let target = target_at(&request, &frame, &pair)?;
-            check_reach(&robot, &target)?;
+            if !is_distant(&pair) {
+                check_reach(&robot, &target)?;
+            }
             Ok(target)
         })
         .await

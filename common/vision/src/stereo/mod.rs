@@ -11,6 +11,7 @@ mod dense;
 mod dense_regions;
 mod link;
 mod matching;
+mod patch_plane;
 mod plane_smoothing;
 mod rectify;
 mod refine;
@@ -21,6 +22,9 @@ mod surface_fit;
 
 pub use dense::{DenseError, DenseRules, Disparity, dense_disparity};
 pub use matching::{MatchFailure, StereoMatch, match_point};
+pub use patch_plane::{
+    PlaneFailure, PlaneRules, StereoPlane, SurfacePlane, measure_distant_surface, measure_plane,
+};
 pub use rectify::{Rectifier, RectifyError};
 pub use rules::{MatchRules, SurfaceRules};
 pub use sparse::sparse_points;

@@ -106,6 +106,37 @@ pub enum SurfaceFailure {
     BadInput(String),
 }
 
+impl SurfaceFailure {
+    /// What a pixel without a match means for its surface.
+    pub(super) fn of_match(failure: MatchFailure, rules: &MatchRules) -> Self {
+        let reason = failure.to_string();
+        match failure {
+            MatchFailure::NoTexture {
+                found_dn,
+                needed_dn,
+            } => SurfaceFailure::NoTexture {
+                found_dn,
+                needed_dn,
+            },
+            MatchFailure::NotUnique { best, second, .. } => {
+                SurfaceFailure::NotUnique { best, second }
+            }
+            MatchFailure::NotMutual { .. } | MatchFailure::OffEpipolar { .. } => {
+                SurfaceFailure::Occluded(reason)
+            }
+            MatchFailure::OutsideImage { .. } | MatchFailure::CurveOutsideImage => {
+                SurfaceFailure::OutsideImage(reason)
+            }
+            MatchFailure::BadInput(_) | MatchFailure::Camera(_) => SurfaceFailure::BadInput(reason),
+            _ => SurfaceFailure::NothingInRange {
+                min_m: rules.range_min_m,
+                max_m: rules.range_max_m,
+                reason,
+            },
+        }
+    }
+}
+
 /// Offsets (px) of the places at which a start is looked for if the pixel itself has no match.
 const OTHER_STARTS: [(f64, f64); 8] = [
     (5.0, 0.0),
@@ -240,29 +271,7 @@ fn find_start(
             }
         }
     }
-    let reason = failure.to_string();
-    Err(match failure {
-        MatchFailure::NoTexture {
-            found_dn,
-            needed_dn,
-        } => SurfaceFailure::NoTexture {
-            found_dn,
-            needed_dn,
-        },
-        MatchFailure::NotUnique { best, second, .. } => SurfaceFailure::NotUnique { best, second },
-        MatchFailure::NotMutual { .. } | MatchFailure::OffEpipolar { .. } => {
-            SurfaceFailure::Occluded(reason)
-        }
-        MatchFailure::OutsideImage { .. } | MatchFailure::CurveOutsideImage => {
-            SurfaceFailure::OutsideImage(reason)
-        }
-        MatchFailure::BadInput(_) | MatchFailure::Camera(_) => SurfaceFailure::BadInput(reason),
-        _ => SurfaceFailure::NothingInRange {
-            min_m: rules.range_min_m,
-            max_m: rules.range_max_m,
-            reason,
-        },
-    })
+    Err(SurfaceFailure::of_match(failure, rules))
 }
 
 /// Points in each quadrant around the pixel: an edge shows as an empty one.
