@@ -196,7 +196,7 @@ impl BaseTask<'_> {
     ///
     /// # Errors
     /// The name of the first condition that is not met.
-    fn judge(
+    pub fn judge(
         &self,
         pose: &PlanarPose,
         target: &TargetSpot,

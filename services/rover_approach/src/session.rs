@@ -1,18 +1,20 @@
 //! One approach from designation to hand-over, as a sequence of stops.
 
-use crate::base_pose::{BaseChoice, BaseRules, BaseTask, Serving, TargetSpot};
-use crate::drive::{DriveRules, next_movement, towards_pose};
+mod near;
+
+use crate::base_pose::{BaseChoice, Serving};
+use crate::drive::{DriveRules, next_movement};
 use crate::filter::{Motion, TargetEstimate};
 use crate::first_ray::{FirstRayRules, first_ray};
 use crate::handover::{HandoverRules, hand_over};
 use crate::hardware::{Frame, Hardware, fault};
-use crate::obstacles::{GroundMap, GroundRules};
+use crate::obstacles::{GroundMap, GroundRules, PlanarPose};
 use crate::report::{Budget, sighting, sigma_mm};
 use crate::service::unfit;
 use crate::shade::Shade;
-use crate::surface::measure_plane;
 use crate::track::{Fix, Refusal, TrackRules, Tracker};
 use nalgebra::{Isometry3, Matrix3, Point3, UnitQuaternion, Vector2, Vector3};
+use near::NearStep;
 use rover_geometry::{Point, tangent_basis};
 use rover_messages::{
     Fault,
@@ -39,16 +41,10 @@ const MAP_STEP_PX: u32 = 16;
 const MAP_FRAMES: usize = 6;
 /// Most stops if the goal does not say.
 const MAX_STOPS_N: u32 = 60;
-/// Close enough to the chosen base pose: m, rad.
-const ARRIVED: (f64, f64) = (0.06, 0.08);
 /// Stops in a row at which the target may be missed.
 const MISSES_N: u32 = 1;
 /// Largest uncertainty with which a missed target is carried on by odometry, mm, one sigma.
 const MISSED_SIGMA_MM: f64 = 120.0;
-/// A pose in which the arm works worse than in the best by no more than this is not left.
-const GOOD_ENOUGH: f64 = 0.15;
-/// Movements near the target after which any pose that serves is taken.
-const PATIENCE_N: u32 = 10;
 
 pub(crate) struct Session<'a> {
     hardware: Hardware<'a>,
@@ -71,6 +67,8 @@ pub(crate) struct Session<'a> {
     shade: Shade,
     /// Stops in a row at which the target was not found.
     missed_n: u32,
+    /// The base pose that is driven to, site frame.
+    aim: Option<PlanarPose>,
 }
 
 impl<'a> Session<'a> {
@@ -124,6 +122,7 @@ impl<'a> Session<'a> {
             near_moves_n: 0,
             shade: Shade::of(robot, &stowed_rad),
             missed_n: 0,
+            aim: None,
         };
         session.approach().await
     }
@@ -138,7 +137,10 @@ impl<'a> Session<'a> {
                 self.far_movement(range_m)?
             } else {
                 match self.near_movement()? {
-                    NearStep::Move(arc) => arc,
+                    NearStep::Move(arc) => {
+                        self.near_moves_n += 1;
+                        arc
+                    }
                     NearStep::Stay(serving, choice) => {
                         return self.finish(serving, choice).await;
                     }
@@ -162,135 +164,6 @@ impl<'a> Session<'a> {
         next_movement(&goal, range_m, &self.map(), self.mobility, &self.rules)
             .map(|m| m.arc)
             .map_err(|blocked| fault("path_blocked", blocked.to_string()).with("range_m", range_m))
-    }
-
-    /// The movement to the best base pose that can be driven to, or the decision to stay.
-    fn near_movement(&mut self) -> Result<NearStep, Fault> {
-        let (_, surface) = self.tracker.target();
-        let spot = TargetSpot {
-            position_m: self.estimate.position_m,
-            normal: surface.plane.normal,
-        };
-        let map = self.map();
-        let (spot, choice) = match self.choose(&spot, &map) {
-            Ok(choice) => (spot, choice),
-            Err(refusal) => self.other_spot(&map).ok_or(refusal)?,
-        };
-        let body = self.robot.pair("body").map_err(|e| unfit(&e))?;
-        let base_rules = BaseRules::default();
-        let level = self.level_from_rover();
-        let task = BaseTask {
-            robot: self.robot,
-            mobility: self.mobility,
-            body,
-            rules: &base_rules,
-            sun: self.sun_in_level().map(|sun| (&self.shade, sun)),
-        };
-        let here = if task.shades(&spot, &level.rotation.inverse()) {
-            Err("own_shadow".to_string())
-        } else {
-            task.serve(&spot)
-        };
-        let best_arm = choice.serving.iter().map(|s| s.arm_score);
-        let best_arm = best_arm.fold(f64::NEG_INFINITY, f64::max);
-        if let (Ok(serving), Some(best)) = (&here, choice.serving.first()) {
-            let away = Vector2::new(best.pose.x_m, best.pose.y_m).norm();
-            let arrived = away <= ARRIVED.0 && best.pose.heading_rad.abs() <= ARRIVED.1
-                || serving.arm_score >= best_arm - GOOD_ENOUGH;
-            if self.missed_n == 0 && (arrived || self.near_moves_n >= PATIENCE_N) {
-                return Ok(NearStep::Stay(serving.clone(), choice));
-            }
-        }
-        self.near_moves_n += 1;
-        let range_m = self.estimate.position_m.xy().norm();
-        let step_m = (self.rules.step_fraction * range_m).max(0.15);
-        // the best first; the next ones are the second candidates if the way to it is blocked
-        let movement = choice.serving.iter().take(200).find_map(|serving| {
-            towards_pose(&serving.pose, step_m, &map, self.mobility, &self.rules)
-        });
-        match (movement, here) {
-            (Some(movement), _) => Ok(NearStep::Move(movement.arc)),
-            (None, Ok(serving)) => Ok(NearStep::Stay(serving, choice)),
-            (None, Err(reason)) => Err(fault(
-                "path_blocked",
-                format!(
-                    "no way is clear to any of {} base poses; where the rover stands: {reason}",
-                    choice.serving.len()
-                ),
-            )),
-        }
-    }
-
-    fn choose(&self, spot: &TargetSpot, map: &GroundMap) -> Result<BaseChoice, Fault> {
-        let body = self.robot.pair("body").map_err(|e| unfit(&e))?;
-        let rules = BaseRules::default();
-        let task = BaseTask {
-            robot: self.robot,
-            mobility: self.mobility,
-            body,
-            rules: &rules,
-            sun: self.sun_in_level().map(|sun| (&self.shade, sun)),
-        };
-        let level = self.level_from_rover();
-        let levelled = TargetSpot {
-            position_m: (level * Point3::from(spot.position_m)).coords,
-            normal: level.rotation * spot.normal,
-        };
-        task.choose(&levelled, map).map_err(|none| {
-            let mut found = fault("no_base_pose", none.to_string())
-                .with("candidates_n", f64::from(none.candidates_n));
-            for (name, n) in &none.refused {
-                found = found.with(&format!("{name}_n"), f64::from(*n));
-            }
-            found
-        })
-    }
-
-    /// Another spot within the goal's radius that some base pose serves; the tracker goes over to
-    /// it.
-    fn other_spot(&mut self, map: &GroundMap) -> Option<(TargetSpot, BaseChoice)> {
-        let radius_m = self.goal.spot_radius_m;
-        if radius_m <= 0.0 {
-            return None;
-        }
-        let surface = *self.tracker.target().1;
-        let plane = surface.plane;
-        let unit = nalgebra::Unit::try_new(plane.normal, 1e-9)?;
-        let (a, b) = tangent_basis(&unit);
-        let view = Arc::clone(&self.now.view);
-        let camera = &view.cameras.left;
-        for part in [0.5, 1.0] {
-            for k in 0..8 {
-                let angle = f64::from(k) * std::f64::consts::FRAC_PI_4;
-                let offset = (a * angle.cos() + b * angle.sin()) * (part * radius_m);
-                let Ok(pixel) = camera.project(&(plane.point + offset)) else {
-                    continue;
-                };
-                let range = surface.range_m;
-                let rules = &self.tracker.rules().plane;
-                let Ok(there) =
-                    measure_plane(&view, &pixel, [0.7 * range, 1.4 * range], None, rules)
-                else {
-                    continue;
-                };
-                let spot = TargetSpot {
-                    position_m: there.plane.point,
-                    normal: there.plane.normal,
-                };
-                let moved = there.plane.point - plane.point;
-                if moved.norm() > radius_m * 1.2 {
-                    continue;
-                }
-                if let Ok(choice) = self.choose(&spot, map)
-                    && self.tracker.move_to(&view, pixel).is_ok()
-                {
-                    self.estimate.position_m = there.plane.point;
-                    self.spot_offset_m = Some(moved);
-                    return Some((spot, choice));
-                }
-            }
-        }
-        None
     }
 
     /// After a movement: where is the target now, and is everything within its limits?
@@ -651,12 +524,6 @@ impl<'a> Session<'a> {
             score: None,
         }
     }
-}
-
-#[allow(clippy::large_enum_variant)] // one lives at a time
-enum NearStep {
-    Move(DriveArc),
-    Stay(Serving, BaseChoice),
 }
 
 /// A rotation as a transform.

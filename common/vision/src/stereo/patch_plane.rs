@@ -190,9 +190,22 @@ pub fn measure_plane(
     rules: &PlaneRules,
 ) -> Result<StereoPlane, PlaneFailure> {
     let normals: Vec<Vector3<f64>> = normal.copied().into_iter().collect();
-    let matching = rules.matching(range_m, &normals);
-    let found = match_point(left, right, cameras, pixel_px, &matching)?;
-    plane_of(cameras, &found, rules).ok_or(PlaneFailure::EdgeOn)
+    let measured = |rules: &PlaneRules| {
+        let matching = rules.matching(range_m, &normals);
+        let found = match_point(left, right, cameras, pixel_px, &matching)?;
+        plane_of(cameras, &found, rules).ok_or(PlaneFailure::EdgeOn)
+    };
+    // A fit that wanders has too little in its window to hold on to.
+    let larger = PlaneRules {
+        half_window_px: rules.half_window_px * 3 / 2,
+        ..rules.clone()
+    };
+    measured(rules).or_else(|failure| match failure {
+        PlaneFailure::Match(MatchFailure::Diverged { .. }) => {
+            measured(&larger).map_err(|_| failure)
+        }
+        _ => Err(failure),
+    })
 }
 
 fn plane_of(pair: &StereoPair, found: &StereoMatch, rules: &PlaneRules) -> Option<StereoPlane> {

@@ -1,0 +1,198 @@
+//! The last metres: which base pose to take, and the movement towards it.
+
+use super::Session;
+use crate::base_pose::{BaseChoice, BaseRules, BaseTask, Serving, TargetSpot};
+use crate::drive::towards_pose;
+use crate::hardware::fault;
+use crate::obstacles::{GroundMap, PlanarPose};
+use crate::service::unfit;
+use crate::surface::measure_plane;
+use nalgebra::{Point3, Vector2};
+use rover_geometry::tangent_basis;
+use rover_messages::{Fault, mobility::DriveArc};
+use std::sync::Arc;
+
+/// A pose in which the arm works worse than in the best by no more than this is not left.
+const GOOD_ENOUGH: f64 = 0.15;
+/// Close enough to the chosen base pose: m, rad.
+const ARRIVED: (f64, f64) = (0.06, 0.08);
+/// Movements near the target after which any pose that serves is taken.
+const PATIENCE_N: u32 = 10;
+
+#[allow(clippy::large_enum_variant)] // one lives at a time
+pub(super) enum NearStep {
+    Move(DriveArc),
+    Stay(Serving, BaseChoice),
+}
+
+impl Session<'_> {
+    /// The movement to the best base pose that can be driven to, or the decision to stay.
+    pub(super) fn near_movement(&mut self) -> Result<NearStep, Fault> {
+        let (_, surface) = self.tracker.target();
+        let spot = TargetSpot {
+            position_m: self.estimate.position_m,
+            normal: surface.plane.normal,
+        };
+        let map = self.map();
+        let (spot, choice) = match self.choose(&spot, &map) {
+            Ok(choice) => (spot, choice),
+            Err(refusal) => self.other_spot(&map).ok_or(refusal)?,
+        };
+        let level = self.level_from_rover();
+        let rules = BaseRules::default();
+        let task = self.task(&rules)?;
+        let here = if task.shades(&spot, &level.rotation.inverse()) {
+            Err("own_shadow".to_string())
+        } else {
+            task.serve(&spot)
+        };
+        let best_arm = choice.serving.iter().map(|s| s.arm_score);
+        let best_arm = best_arm.fold(f64::NEG_INFINITY, f64::max);
+        if let (Ok(serving), Some(best)) = (&here, choice.serving.first()) {
+            let away = Vector2::new(best.pose.x_m, best.pose.y_m).norm();
+            let arrived = away <= ARRIVED.0 && best.pose.heading_rad.abs() <= ARRIVED.1
+                || serving.arm_score >= best_arm - GOOD_ENOUGH;
+            if self.missed_n == 0 && (arrived || self.near_moves_n >= PATIENCE_N) {
+                return Ok(NearStep::Stay(serving.clone(), choice));
+            }
+        }
+        // A base pose once chosen is kept while it serves: each look measures target and ground a
+        // little differently, and another pose would be the best one every time.
+        let kept = self
+            .aim
+            .map(|aim| self.in_level(&aim))
+            .filter(|pose| task.judge(pose, &self.levelled(&spot), &map).is_ok());
+        let range_m = self.estimate.position_m.xy().norm();
+        let step_m = (self.rules.step_fraction * range_m).max(0.15);
+        // the best first; the next ones are the second candidates if the way to it is blocked
+        let others = choice.serving.iter().take(200).map(|serving| serving.pose);
+        let way = kept.into_iter().chain(others).find_map(|pose| {
+            let movement = towards_pose(&pose, step_m, &map, self.mobility, &self.rules)?;
+            Some((pose, movement))
+        });
+        self.aim = way.map(|(pose, _)| self.in_site(&pose));
+        let movement = way.map(|(_, movement)| movement);
+        match (movement, here) {
+            (Some(movement), _) => Ok(NearStep::Move(movement.arc)),
+            (None, Ok(serving)) => Ok(NearStep::Stay(serving, choice)),
+            (None, Err(reason)) => Err(fault(
+                "path_blocked",
+                format!(
+                    "no way is clear to any of {} base poses; where the rover stands: {reason}",
+                    choice.serving.len()
+                ),
+            )),
+        }
+    }
+
+    fn choose(&self, spot: &TargetSpot, map: &GroundMap) -> Result<BaseChoice, Fault> {
+        let rules = BaseRules::default();
+        let task = self.task(&rules)?;
+        let levelled = self.levelled(spot);
+        task.choose(&levelled, map).map_err(|none| {
+            let mut found = fault("no_base_pose", none.to_string())
+                .with("candidates_n", f64::from(none.candidates_n));
+            for (name, n) in &none.refused {
+                found = found.with(&format!("{name}_n"), f64::from(*n));
+            }
+            found
+        })
+    }
+
+    /// Another spot within the goal's radius that some base pose serves; the tracker goes over to
+    /// it.
+    fn other_spot(&mut self, map: &GroundMap) -> Option<(TargetSpot, BaseChoice)> {
+        let radius_m = self.goal.spot_radius_m;
+        if radius_m <= 0.0 {
+            return None;
+        }
+        let surface = *self.tracker.target().1;
+        let plane = surface.plane;
+        let unit = nalgebra::Unit::try_new(plane.normal, 1e-9)?;
+        let (a, b) = tangent_basis(&unit);
+        let view = Arc::clone(&self.now.view);
+        let camera = &view.cameras.left;
+        for part in [0.5, 1.0] {
+            for k in 0..8 {
+                let angle = f64::from(k) * std::f64::consts::FRAC_PI_4;
+                let offset = (a * angle.cos() + b * angle.sin()) * (part * radius_m);
+                let Ok(pixel) = camera.project(&(plane.point + offset)) else {
+                    continue;
+                };
+                let range = surface.range_m;
+                let rules = &self.tracker.rules().plane;
+                let Ok(there) =
+                    measure_plane(&view, &pixel, [0.7 * range, 1.4 * range], None, rules)
+                else {
+                    continue;
+                };
+                let spot = TargetSpot {
+                    position_m: there.plane.point,
+                    normal: there.plane.normal,
+                };
+                let moved = there.plane.point - plane.point;
+                if moved.norm() > radius_m * 1.2 {
+                    continue;
+                }
+                if let Ok(choice) = self.choose(&spot, map)
+                    && self.tracker.move_to(&view, pixel).is_ok()
+                {
+                    self.estimate.position_m = there.plane.point;
+                    self.spot_offset_m = Some(moved);
+                    return Some((spot, choice));
+                }
+            }
+        }
+        None
+    }
+
+    fn task<'r>(&'r self, rules: &'r BaseRules) -> Result<BaseTask<'r>, Fault> {
+        Ok(BaseTask {
+            robot: self.robot,
+            mobility: self.mobility,
+            body: self.robot.pair("body").map_err(|e| unfit(&e))?,
+            rules,
+            sun: self.sun_in_level().map(|sun| (&self.shade, sun)),
+        })
+    }
+
+    fn levelled(&self, spot: &TargetSpot) -> TargetSpot {
+        let level = self.level_from_rover();
+        TargetSpot {
+            position_m: (level * Point3::from(spot.position_m)).coords,
+            normal: level.rotation * spot.normal,
+        }
+    }
+
+    /// Where the rover stands, site frame.
+    fn standing(&self) -> PlanarPose {
+        let pose = &self.wheels.pose;
+        PlanarPose {
+            x_m: pose.position_m.coords.x,
+            y_m: pose.position_m.coords.y,
+            heading_rad: pose.heading_rad,
+        }
+    }
+
+    fn in_site(&self, in_level: &PlanarPose) -> PlanarPose {
+        let here = self.standing();
+        let place = here.at(in_level.x_m, in_level.y_m);
+        PlanarPose {
+            x_m: place.x,
+            y_m: place.y,
+            heading_rad: here.heading_rad + in_level.heading_rad,
+        }
+    }
+
+    fn in_level(&self, in_site: &PlanarPose) -> PlanarPose {
+        let here = self.standing();
+        let place = here.local(&Vector2::new(in_site.x_m, in_site.y_m));
+        let turn = in_site.heading_rad - here.heading_rad;
+        let whole = std::f64::consts::TAU;
+        PlanarPose {
+            x_m: place.x,
+            y_m: place.y,
+            heading_rad: turn - whole * (turn / whole).round(),
+        }
+    }
+}
