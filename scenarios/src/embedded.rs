@@ -45,7 +45,7 @@ pub const ROBOTS: &[ShippedFile] = &[
 ];
 
 /// Name of the scenario that runs when none is named.
-pub const DEFAULT_SCENARIO: &str = "scenarios/bluestreak.toml";
+pub const DEFAULT_SCENARIO: &str = "scenarios/single_cycle.toml";
 
 /// The shipped file of that name, with or without its folder.
 pub fn find(files: &'static [ShippedFile], name: &str) -> Option<ShippedFile> {

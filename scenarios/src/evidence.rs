@@ -3,7 +3,7 @@
 
 use rover_bus::{BusError, Peer};
 use rover_messages::{
-    Nothing,
+    Fault, Nothing,
     approach::DriveToFeedback,
     imaging::{CaptureRequest, ImageData, StereoFrame},
     keys,
@@ -20,6 +20,8 @@ pub struct Evidence {
     pub designation: Option<StereoFrame>,
     /// The target as the approach found it again at its stops.
     pub stops: Vec<StopPicture>,
+    /// The last image of an approach that failed, and where the target was expected in it, px.
+    pub lost: Option<(ImageData, Option<[f64; 2]>)>,
     /// Outside views of the rover: where it set out from, and where it stands before the target.
     pub chase_views: Vec<ImageData>,
     /// The target in the pair that the arm works with.
@@ -104,6 +106,15 @@ impl Evidence {
                 score: feedback.score,
             });
         }
+    }
+
+    /// Keeps what the tracking pair sees where an approach failed.
+    pub(crate) async fn lost(&mut self, peer: &Peer, pair: &str, fault: &Fault, limit: Duration) {
+        let detail = |name: &str| fault.details.get(name).copied();
+        let expected = detail("predicted_u_px").zip(detail("predicted_v_px"));
+        let frame = kept("image", capture(peer, pair, limit).await);
+        self.lost = frame.map(|f| (f.images.left, expected.map(|(u, v)| [u, v])));
+        self.chase(peer, limit).await;
     }
 
     pub(crate) async fn arrived(&mut self, peer: &Peer, limit: Duration) {

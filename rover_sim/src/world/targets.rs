@@ -125,7 +125,11 @@ impl World {
                         && found.normal.z > 0.15
                 }
             };
-            if !fits || !(near..=far).contains(&place.range_m) {
+            if !fits
+                || !(near..=far).contains(&place.range_m)
+                || !self.is_lit(&found)
+                || !self.is_plain(&eye, &found)
+            {
                 continue;
             }
             let in_rover = (world_from_rover.inverse() * Point3::from(found.point_m)).coords;
@@ -146,6 +150,48 @@ impl World {
             request.surface
         );
         Err(Fault::new(HARDWARE, "no_place", message).with("tried_n", f64::from(TRIES)))
+    }
+
+    /// Whether the sun shines on a surface point.
+    fn is_lit(&self, place: &SurfacePoint) -> bool {
+        /// Sines of smaller angles are grazing light.
+        const GRAZING: f64 = 0.15;
+        /// Start of the ray above the surface, m.
+        const LIFT_M: f64 = 0.002;
+        let sun = &self.description.sun;
+        let (azimuth, elevation) = (sun.azimuth_deg.to_radians(), sun.elevation_deg.to_radians());
+        let level = elevation.cos();
+        let towards = Vector3::new(
+            level * azimuth.cos(),
+            level * azimuth.sin(),
+            elevation.sin(),
+        );
+        let start = place.point_m + place.normal.into_inner() * LIFT_M;
+        place.normal.dot(&towards) > GRAZING
+            && lock(&self.eyes).first_on(&start, &towards).is_none()
+    }
+
+    /// Whether what surrounds a surface point, as seen from `eye`, is the same surface: nobody
+    /// names a target on an edge.
+    fn is_plain(&self, eye: &Vector3<f64>, place: &SurfacePoint) -> bool {
+        /// Distance of what must be alike, m.
+        const AROUND_M: f64 = 0.03;
+        /// Largest step in range, m, and largest angle between the normals, rad.
+        const STEP_M: f64 = 0.10;
+        const BEND_RAD: f64 = 0.7;
+        let along = place.point_m - eye;
+        let (range_m, along) = (along.norm(), along.normalize());
+        let aside = along.cross(&Vector3::z()).normalize();
+        let up = aside.cross(&along);
+        [aside, -aside, up, -up].iter().all(|way| {
+            let towards = (along * range_m + way * AROUND_M).normalize();
+            lock(&self.eyes).first_on(eye, &towards).is_some_and(|at| {
+                let flat_m = STEP_M + AROUND_M / along.dot(&place.normal).abs().max(0.05);
+                at.body_n == place.body_n
+                    && ((at.point_m - eye).norm() - range_m).abs() < flat_m
+                    && at.normal.angle(&place.normal) < BEND_RAD
+            })
+        })
     }
 
     /// Where the view is best: the mast's head, or the first pair.

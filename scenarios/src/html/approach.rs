@@ -1,7 +1,7 @@
 //! The approach as a strip of pictures, the tracking in plots, the error by source.
 
 use super::{
-    BLUE, ORANGE, PURPLE, PageError, escape,
+    BLUE, ORANGE, PURPLE, PageError, YELLOW, escape,
     picture::{Mark, Overlay, figure},
     plot::{Marks, Plot, Series},
     section,
@@ -17,7 +17,7 @@ pub(super) fn approach(report: &RunReport, evidence: &Evidence) -> Result<String
     let mut out = String::new();
     let views = evidence.chase_views.iter().zip([
         "The rover where the target was named",
-        "The rover where it places the instrument",
+        "The rover where the approach ended",
     ]);
     let mut figures = String::new();
     for (view, caption) in views {
@@ -45,6 +45,14 @@ pub(super) fn approach(report: &RunReport, evidence: &Evidence) -> Result<String
             .map_or_else(String::new, |s| format!(", correlation {s:.2}"));
         let caption = format!("Stop {}, {:.2} m{score}", n + 1, stop.range_m);
         figures += &figure(&stop.image, &overlay, &caption)?;
+    }
+    if let Some((image, expected)) = &evidence.lost {
+        let mark = |pixel: &[f64; 2]| Mark::ring(*pixel, YELLOW, "expected");
+        let overlay = Overlay {
+            marks: expected.iter().map(mark).collect(),
+            path: vec![],
+        };
+        figures += &figure(image, &overlay, "Where the approach ended")?;
     }
     if !figures.is_empty() {
         let _ = write!(out, "<div class=\"strip\">{figures}</div>");

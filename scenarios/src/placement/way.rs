@@ -109,6 +109,10 @@ impl Mission<'_> {
             },
         )
         .await;
+        if let (Err(fault), Some(evidence)) = (&reached, &mut self.evidence) {
+            let pair = &goal.target.pair;
+            evidence.lost(peer, pair, fault, limits.question()).await;
+        }
         let reached: DriveToResult = self.end(started, reached).await?;
         if let Some(evidence) = &mut self.evidence {
             evidence.arrived(peer, limits.question()).await;

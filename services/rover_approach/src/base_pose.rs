@@ -11,7 +11,7 @@ use crate::shade::Shade;
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector2, Vector3};
 use rover_cameras::StereoPair;
 use rover_kinematics::{AxisGoal, solve_axis};
-use rover_robot::{CameraPairDescription, MobilityDescription, Robot};
+use rover_robot::{CameraMount, CameraPairDescription, MobilityDescription, Robot};
 use std::collections::BTreeMap;
 
 /// How base poses are chosen.
@@ -39,6 +39,8 @@ pub struct BaseRules {
     pub max_slope_rad: f64,
     /// Distance of the target from the rover's own shadow, m.
     pub shade_margin_m: f64,
+    /// Distance of the rover's parts from the line of sight of the mast's cameras, m.
+    pub view_margin_m: f64,
 }
 
 impl Default for BaseRules {
@@ -55,6 +57,7 @@ impl Default for BaseRules {
             min_limit_rad: 0.05,
             max_slope_rad: 0.26,
             shade_margin_m: 0.06,
+            view_margin_m: 0.06,
         }
     }
 }
@@ -122,9 +125,10 @@ pub struct BaseTask<'a> {
     pub body: &'a CameraPairDescription,
     /// How to choose.
     pub rules: &'a BaseRules,
-    /// What casts shadows, and the unit vector towards the sun in the frame of the target, if it
-    /// is known.
-    pub sun: Option<(&'a Shade, Vector3<f64>)>,
+    /// What of the rover is in the way of light and view.
+    pub shade: &'a Shade,
+    /// Unit vector towards the sun in the frame of the target, if it is known.
+    pub sun: Option<Vector3<f64>>,
 }
 
 /// The target in some rover frame.
@@ -216,7 +220,8 @@ impl BaseTask<'_> {
         }
         let mut found = self.serve(&spot)?;
         let room = 1.0 - standing.slope_rad / self.rules.max_slope_rad;
-        let way = Vector2::new(pose.x_m, pose.y_m).norm() + 0.5 * pose.heading_rad.abs();
+        // A turn shows the target from another side, which costs more than its way.
+        let way = Vector2::new(pose.x_m, pose.y_m).norm() + 2.0 * pose.heading_rad.abs();
         found.score +=
             0.3 * room + 0.5 * standing.belly_m.min(0.2) - 0.1 * way - standing.unevenness_m;
         found.pose = *pose;
@@ -228,13 +233,16 @@ impl BaseTask<'_> {
     ///
     /// # Errors
     /// The name of the first condition that is not met: `target_out_of_view`,
-    /// `target_out_of_reach`, `joint_limit`, `singular`, `fiducial_hidden`.
+    /// `hidden_by_the_rover`, `target_out_of_reach`, `joint_limit`, `singular`, `fiducial_hidden`.
     pub fn serve(&self, spot: &TargetSpot) -> Result<Serving, String> {
         let r = self.rules;
         let pair = &self.body.cameras;
         self.sees(pair, &spot.position_m)
             .then_some(())
             .ok_or("target_out_of_view")?;
+        if self.hidden_from_mast(spot) {
+            return Err("hidden_by_the_rover".into());
+        }
         let robot = self.robot;
         let base_from_rover = robot.rover_from_arm_base.isometry.inverse();
         let axis = nalgebra::Unit::try_new(base_from_rover.rotation * -spot.normal, 1e-9)
@@ -296,10 +304,30 @@ impl BaseTask<'_> {
     /// Whether the rover shades the target `spot` (frame of the rover that stands there, turned
     /// by `there_from_here` against that of the sun).
     pub fn shades(&self, spot: &TargetSpot, there_from_here: &UnitQuaternion<f64>) -> bool {
-        self.sun.as_ref().is_some_and(|(shade, sun)| {
+        self.sun.as_ref().is_some_and(|sun| {
             let sun = there_from_here * sun;
-            shade.covers(&spot.position_m, &sun, self.rules.shade_margin_m)
+            let margin_m = self.rules.shade_margin_m;
+            self.shade.covers(&spot.position_m, &sun, margin_m)
         })
+    }
+
+    /// Whether the rover hides the target `spot` (its own frame) from a camera on its mast.
+    fn hidden_from_mast(&self, spot: &TargetSpot) -> bool {
+        let d = self.robot.description();
+        let Some(mast) = &d.mast else { return false };
+        let Some([pan, tilt]) = mast.angles_towards(&spot.position_m.into()) else {
+            return true;
+        };
+        let rover_from_head = mast.rover_from_head(pan, tilt).isometry;
+        let pairs = d.cameras.iter().filter(|p| p.mount == CameraMount::Mast);
+        pairs
+            .flat_map(|pair| [&pair.cameras.left, &pair.cameras.right])
+            .any(|camera| {
+                let centre = Point3::from(*camera.model.cahv()[0]);
+                let eye = (rover_from_head * centre).coords;
+                let margin_m = self.rules.view_margin_m;
+                self.shade.hides(&spot.position_m, &eye, margin_m)
+            })
     }
 
     fn sees(&self, pair: &StereoPair, point: &Vector3<f64>) -> bool {
@@ -387,6 +415,7 @@ mod tests {
             mobility: robot.mobility().unwrap(),
             body: robot.pair("body").unwrap(),
             rules: &BaseRules::default(),
+            shade: &Shade::of(&robot, robot.posture("stow").unwrap()),
             sun: None,
         };
         let spot = TargetSpot {

@@ -20,6 +20,9 @@ pub struct DriveRules {
     pub check_m: f64,
     /// Beyond this angle to the goal the rover turns in place first, rad.
     pub turn_first_rad: f64,
+    /// Largest turn at once near the target, rad: more would show it from another side than it is
+    /// known from.
+    pub max_turn_rad: f64,
     /// Steepest ground, rad.
     pub max_slope_rad: f64,
 }
@@ -35,6 +38,7 @@ impl DriveRules {
             curvatures_n: 8,
             check_m: 0.1,
             turn_first_rad: 0.5,
+            max_turn_rad: 0.35,
             max_slope_rad: mobility.limits.slope_rad,
         }
     }
@@ -155,10 +159,11 @@ pub fn towards_pose(
     rules: &DriveRules,
 ) -> Option<Movement> {
     const AIM_RAD: f64 = 0.06;
+    let bounded = |angle: f64| angle.clamp(-rules.max_turn_rad, rules.max_turn_rad);
     let place = Vector2::new(pose.x_m, pose.y_m);
     let distance = place.norm();
     if distance <= rules.min_step_m.max(0.04) {
-        return (pose.heading_rad.abs() > 0.02).then(|| turn(pose.heading_rad));
+        return (pose.heading_rad.abs() > 0.02).then(|| turn(bounded(pose.heading_rad)));
     }
     let bearing = place.y.atan2(place.x);
     let (aim, sign) = if bearing.abs() <= std::f64::consts::FRAC_PI_2 {
@@ -181,16 +186,21 @@ pub fn towards_pose(
         return None;
     }
     if aim.abs() > AIM_RAD && distance > 0.08 {
-        return Some(turn(aim));
+        return Some(turn(bounded(aim)));
     }
-    let length_m = sign * distance.min(step_m);
-    Some(Movement {
+    Some(straight(sign * distance.min(step_m)))
+}
+
+/// A straight movement, backwards where the length is negative.
+#[must_use]
+pub fn straight(length_m: f64) -> Movement {
+    Movement {
         arc: DriveArc::Arc {
             length_m,
             curvature_1_m: 0.0,
         },
         end: after_arc(length_m, 0.0),
-    })
+    }
 }
 
 /// A turn in place.

@@ -30,7 +30,7 @@ use rover_vision::{MatchRules, sparse_points};
 use std::sync::Arc;
 
 /// Range at which the base pose is chosen, m along the ground.
-const NEAR_M: f64 = 2.6;
+const NEAR_M: f64 = 3.2;
 /// Distance from the target that is aimed at before, m.
 const STANDOFF_M: f64 = 1.1;
 /// Where the ground is looked at before each movement, m ahead.
@@ -278,9 +278,12 @@ impl<'a> Session<'a> {
             .iter()
             .fold(0.0_f64, |m, s| m.max(*s));
         if self.missed_n > MISSES_N || worst_mm > MISSED_SIGMA_MM {
+            let [u_px, v_px] = sightings.last().map_or([0.0; 2], |s| s.predicted_px);
             return Err(fault("target_lost", refusal.to_string())
                 .with("range_m", range_m)
-                .with("sigma_mm", worst_mm));
+                .with("sigma_mm", worst_mm)
+                .with("predicted_u_px", u_px)
+                .with("predicted_v_px", v_px));
         }
         self.tracker.coast(&motion.now_from_last);
         (self.now, self.wheels) = (frame, wheels);

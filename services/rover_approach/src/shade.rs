@@ -1,6 +1,8 @@
-//! The rover's own shadow: a template that a moving shadow edge crosses is lost, and where the
-//! rover itself casts the edge it moves with every metre driven. So no base pose is chosen from
-//! which the rover shades its target.
+//! What the rover itself keeps from its target: light and view.
+//!
+//! A template that a moving shadow edge crosses is lost, and where the rover itself casts the edge
+//! it moves with every metre driven. The same goes for a target that the rover's own body hides
+//! from the mast. So no base pose is chosen from which either happens.
 
 use nalgebra::{Point3, Vector3};
 use rover_robot::{Capsule, Robot};
@@ -32,6 +34,21 @@ impl Shade {
         Self { capsules }
     }
 
+    /// Whether the rover comes within `margin_m` of the line of sight from a camera at `eye_m` to
+    /// `point_m`, rover frame. What carries the camera is left out.
+    #[must_use]
+    pub fn hides(&self, point_m: &Vector3<f64>, eye_m: &Vector3<f64>, margin_m: f64) -> bool {
+        /// Parts so near to the camera carry it, m.
+        const CARRIER_M: f64 = 0.15;
+        let Some(along) = (eye_m - point_m).try_normalize(1e-9) else {
+            return false;
+        };
+        self.capsules.iter().any(|(a, b, radius)| {
+            point_to_segment(eye_m, a, b) > radius + CARRIER_M
+                && ray_to_segment(point_m, &along, a, b) < radius + margin_m
+        })
+    }
+
     /// Whether the sun's ray to `point_m` passes within `margin_m` of the rover. Point and `sun`
     /// (unit, towards the sun) in the rover frame.
     #[must_use]
@@ -40,6 +57,13 @@ impl Shade {
             .iter()
             .any(|(a, b, radius)| ray_to_segment(point_m, sun, a, b) < radius + margin_m)
     }
+}
+
+/// Distance between a point and a segment, m.
+fn point_to_segment(point: &Vector3<f64>, a: &Vector3<f64>, b: &Vector3<f64>) -> f64 {
+    let ab = b - a;
+    let s = (point - a).dot(&ab) / ab.norm_squared().max(1e-12);
+    (point - a - ab * s.clamp(0.0, 1.0)).norm()
 }
 
 /// Distance between a ray (unit direction) and a segment, m.
@@ -121,6 +145,18 @@ mod tests {
             let found = ray_to_segment(&origin, &along, &a, &b);
             assert!((found - least).abs() < 2e-3, "{found} {least}");
         }
+    }
+
+    #[test]
+    fn the_camera_bar_hides_what_lies_below_it_and_the_mast_hides_nothing_from_its_own_camera() {
+        let text = include_str!("../../../scenarios/robots/rocky8.toml");
+        let robot = Robot::parse(text, "rocky8.toml").unwrap();
+        let shade = Shade::of(&robot, robot.posture("stow").unwrap());
+        let eye = Vector3::new(0.35, 0.1, 1.34);
+        let ahead = |x: f64| Vector3::new(x, 0.0, 0.0);
+        // the line through the bar at x = 0.43, z = 0.68
+        assert!(shade.hides(&ahead(0.51), &eye, 0.0));
+        assert!(!shade.hides(&ahead(1.2), &eye, 0.05));
     }
 
     #[test]

@@ -25,6 +25,8 @@ pub struct TrackRules {
     pub min_half_px: usize,
     /// Anchor anew when the anchor's range is so many times the present one.
     pub anchor_ratio: f64,
+    /// Anchor anew when the target is seen from a direction that differs so much, rad.
+    pub anchor_turn_rad: f64,
     /// Least weighted correlation of an accepted match.
     pub min_score: f64,
     /// Farthest that tracking back may end from the anchor pixel, anchor px.
@@ -49,6 +51,7 @@ impl Default for TrackRules {
             half_px: 12,
             min_half_px: 7,
             anchor_ratio: 1.4,
+            anchor_turn_rad: 0.25,
             min_score: 0.80,
             max_back_px: 0.85,
             search_sigma: 3.5,
@@ -427,9 +430,10 @@ impl Tracker {
         self.pixel_px = found.pixel_px;
         self.surface = found.surface;
         let shrunk = self.anchors[index].range_m / found.surface.range_m >= self.rules.anchor_ratio;
+        let turned = self.view_change_rad(view, index) >= self.rules.anchor_turn_rad;
         let mut relief_px = Vector2::zeros();
         let mut anchored = false;
-        if shrunk || last_stop {
+        if shrunk || turned || last_stop {
             if let Some(moved) = self.relieved(view, index) {
                 relief_px = moved.0 - self.pixel_px;
                 (self.pixel_px, self.surface) = moved;
@@ -455,6 +459,16 @@ impl Tracker {
             anchored,
             relief_px,
         }
+    }
+
+    /// Angle at the target between the present view and that of an anchor, rad.
+    fn view_change_rad(&self, view: &View, index: usize) -> f64 {
+        let anchor = &self.anchors[index];
+        let target = self.surface.plane.point;
+        let here = view.cameras.left.model.cahv()[0] - target;
+        let then = *anchor.view.cameras.left.model.cahv()[0];
+        let then = anchor.anchor_from_rover.inverse() * nalgebra::Point3::from(then);
+        here.angle(&(then.coords - target))
     }
 
     /// Carries the target along by odometry alone, where it could not be found.

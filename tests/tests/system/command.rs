@@ -13,6 +13,8 @@ pub fn rover(arguments: &[&str]) -> Output {
         .expect("the rover command starts")
 }
 
+const TESTBED: &str = "scenarios/bluestreak.toml";
+
 /// Runs a scenario; gives exit code and report.
 pub fn run(arguments: &[&str]) -> (i32, Value) {
     let mut all = vec!["run"];
@@ -25,6 +27,14 @@ pub fn run(arguments: &[&str]) -> (i32, Value) {
         panic!("{arguments:?}: exit {code}, no report ({e}): {messages}")
     });
     (code, report)
+}
+
+/// A number of a report.
+pub fn number(report: &Value, path: &str) -> f64 {
+    report
+        .pointer(path)
+        .and_then(Value::as_f64)
+        .unwrap_or_else(|| panic!("no {path}: {report:#}"))
 }
 
 fn refused(arguments: &[&str], expected: &[&str]) {
@@ -55,10 +65,13 @@ fn a_mistyped_or_impossible_setting_is_refused_with_exit_2() {
         &["speed_mm_s", "-1"],
     );
     refused(
-        &["run", "--set", "target.pixel_px=[900.0, 20.0]"],
+        &["run", TESTBED, "--set", "target.pixel_px=[900.0, 20.0]"],
         &["pixel_px", "900"],
     );
-    refused(&["run", "--set", "target.pair=\"mast\""], &["mast", "body"]);
+    refused(
+        &["run", TESTBED, "--set", "target.pair=\"mast\""],
+        &["mast", "body"],
+    );
 }
 
 #[test]

@@ -6,3 +6,4 @@ mod command;
 mod faults;
 mod foreign_client;
 mod placement;
+mod single_cycle;

@@ -1,22 +1,17 @@
 //! Whole placements: accuracy over seeds, determinism, the shipped variants.
 
-use crate::command::run;
+use crate::command::{number, run};
 use serde_json::Value;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-fn number(report: &Value, path: &str) -> f64 {
-    report
-        .pointer(path)
-        .and_then(Value::as_f64)
-        .unwrap_or_else(|| panic!("no {path}: {report:#}"))
-}
+const TESTBED: &str = "scenarios/bluestreak.toml";
 
 #[test]
 fn the_testbed_is_placed_within_its_budget_over_seeds() {
     let mut lateral = Vec::new();
     let mut open_loop = Vec::new();
     for seed in 101..=108 {
-        let (code, report) = run(&["scenarios/bluestreak.toml", "--seed", &seed.to_string()]);
+        let (code, report) = run(&[TESTBED, "--seed", &seed.to_string()]);
         assert_eq!(
             (code, &report["outcome"]),
             (0, &Value::from("placed")),
@@ -81,7 +76,7 @@ fn a_missing_surface_ends_the_run_safely_with_exit_3() {
 
 #[test]
 fn a_pixel_in_the_sky_is_refused_with_exit_3_and_a_reason() {
-    let (code, report) = run(&["--set", "target.pixel_px=[638.0, 2.0]"]);
+    let (code, report) = run(&[TESTBED, "--set", "target.pixel_px=[638.0, 2.0]"]);
     assert_eq!(code, 3, "{report:#}");
     let reason = report["reason"].as_str().unwrap();
     assert!(
@@ -117,10 +112,10 @@ fn beside_other_work<T>(work: impl FnOnce() -> T) -> T {
 
 #[test]
 fn one_seed_gives_one_digest_in_process_in_processes_and_on_a_busy_machine() {
-    let (_, first) = run(&["--seed", "7"]);
-    let (_, again) = beside_other_work(|| run(&["--seed", "7"]));
-    let (_, apart) = run(&["--seed", "7", "--processes"]);
-    let (_, other) = run(&["--seed", "8"]);
+    let (_, first) = run(&[TESTBED, "--seed", "7"]);
+    let (_, again) = beside_other_work(|| run(&[TESTBED, "--seed", "7"]));
+    let (_, apart) = run(&[TESTBED, "--seed", "7", "--processes"]);
+    let (_, other) = run(&[TESTBED, "--seed", "8"]);
     assert_eq!(first["outcome"], "placed", "{first:#}");
     assert_eq!(first["digest"], again["digest"]);
     assert_eq!(first["digest"], apart["digest"]);

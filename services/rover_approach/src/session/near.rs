@@ -2,7 +2,7 @@
 
 use super::Session;
 use crate::base_pose::{BaseChoice, BaseRules, BaseTask, Serving, TargetSpot};
-use crate::drive::towards_pose;
+use crate::drive::{Movement, next_movement, straight, towards_pose};
 use crate::hardware::fault;
 use crate::obstacles::{GroundMap, PlanarPose};
 use crate::service::unfit;
@@ -12,12 +12,16 @@ use rover_geometry::tangent_basis;
 use rover_messages::{Fault, mobility::DriveArc};
 use std::sync::Arc;
 
+/// Base poses to which a way around is looked for.
+const AROUND_N: usize = 20;
+/// Way back from where no other way is clear, m.
+const RETREAT_M: f64 = 0.4;
 /// A pose in which the arm works worse than in the best by no more than this is not left.
 const GOOD_ENOUGH: f64 = 0.15;
 /// Close enough to the chosen base pose: m, rad.
 const ARRIVED: (f64, f64) = (0.06, 0.08);
 /// Movements near the target after which any pose that serves is taken.
-const PATIENCE_N: u32 = 10;
+const PATIENCE_N: u32 = 14;
 
 #[allow(clippy::large_enum_variant)] // one lives at a time
 pub(super) enum NearStep {
@@ -65,10 +69,23 @@ impl Session<'_> {
         let range_m = self.estimate.position_m.xy().norm();
         let step_m = (self.rules.step_fraction * range_m).max(0.15);
         // the best first; the next ones are the second candidates if the way to it is blocked
-        let others = choice.serving.iter().take(200).map(|serving| serving.pose);
-        let way = kept.into_iter().chain(others).find_map(|pose| {
+        let others = choice.serving.iter().map(|serving| serving.pose);
+        let way = kept.into_iter().chain(others.clone()).find_map(|pose| {
             let movement = towards_pose(&pose, step_m, &map, self.mobility, &self.rules)?;
             Some((pose, movement))
+        });
+        // Where no straight way is clear an arc may lead around, or a way back to look again.
+        let way = way.or_else(|| {
+            if self.near_moves_n >= PATIENCE_N {
+                return None;
+            }
+            let around = others.clone().take(AROUND_N).find_map(|pose| {
+                let goal = Vector2::new(pose.x_m, pose.y_m);
+                next_movement(&goal, range_m, &map, self.mobility, &self.rules)
+                    .ok()
+                    .map(|movement| (pose, movement))
+            });
+            around.or_else(|| Some((others.clone().next()?, self.backwards(&map)?)))
         });
         self.aim = way.map(|(pose, _)| self.in_site(&pose));
         let movement = way.map(|(_, movement)| movement);
@@ -146,13 +163,26 @@ impl Session<'_> {
         None
     }
 
+    /// A way back, if the ground behind is known to be clear.
+    fn backwards(&self, map: &GroundMap) -> Option<Movement> {
+        let behind = PlanarPose {
+            x_m: -RETREAT_M,
+            y_m: 0.0,
+            heading_rad: 0.0,
+        };
+        let slope = self.rules.max_slope_rad;
+        let clear = map.standing(&behind, self.mobility, slope).is_ok();
+        clear.then(|| straight(-RETREAT_M))
+    }
+
     fn task<'r>(&'r self, rules: &'r BaseRules) -> Result<BaseTask<'r>, Fault> {
         Ok(BaseTask {
             robot: self.robot,
             mobility: self.mobility,
             body: self.robot.pair("body").map_err(|e| unfit(&e))?,
             rules,
-            sun: self.sun_in_level().map(|sun| (&self.shade, sun)),
+            shade: &self.shade,
+            sun: self.sun_in_level(),
         })
     }
 
