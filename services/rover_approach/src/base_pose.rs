@@ -25,8 +25,8 @@ pub struct BaseRules {
     pub step_m: f64,
     /// Headings tried about the direction to the target, rad, and their step.
     pub heading_rad: [f64; 2],
-    /// Distance of the tip from the target before contact, m.
-    pub standoff_m: f64,
+    /// Distances of the tip from the target at which the fiducial is looked at, m.
+    pub stations_m: [f64; 2],
     /// Distance of target and fiducial from the images' border, px.
     pub border_px: f64,
     /// Largest angle between the fiducial's normal and the direction to a camera, rad.
@@ -50,7 +50,7 @@ impl Default for BaseRules {
             aside_m: 0.25,
             step_m: 0.05,
             heading_rad: [1.0, 0.125],
-            standoff_m: 0.08,
+            stations_m: [0.12, 0.03],
             border_px: 30.0,
             max_facing_rad: 1.13,
             min_manipulability: 0.05,
@@ -77,7 +77,7 @@ pub struct Serving {
     pub manipulability: f64,
     /// Least distance of a joint from its limits, rad.
     pub limit_rad: f64,
-    /// Angle between the fiducial's normal and the direction to the cameras at the standoff, rad.
+    /// Angle between the fiducial's normal and the direction to the cameras at the worst station, rad.
     pub facing_rad: f64,
     /// How well the arm works there; more is better.
     pub arm_score: f64,
@@ -254,18 +254,27 @@ impl BaseTask<'_> {
         };
         let contact =
             solve_axis(&robot.arm, &robot.tool, &goal(0.0)).map_err(|_| "target_out_of_reach")?;
-        let standoff = solve_axis(&robot.arm, &robot.tool, &goal(r.standoff_m))
-            .map_err(|_| "target_out_of_reach")?;
+        let mut stations = Vec::new();
+        for station_m in r.stations_m {
+            let solved = solve_axis(&robot.arm, &robot.tool, &goal(station_m));
+            stations.push(solved.map_err(|_| "target_out_of_reach")?);
+        }
         let mut best: Option<Serving> = None;
         let mut reason = "joint_limit";
         for touch in &contact {
-            let Some(before) = standoff.iter().find(|s| s.branch == touch.branch) else {
+            let before: Vec<_> = stations
+                .iter()
+                .filter_map(|solved| solved.iter().find(|s| s.branch == touch.branch))
+                .collect();
+            if before.len() < stations.len() {
                 continue;
-            };
-            let limit_rad = self
-                .limit(&touch.joints_rad)
-                .min(self.limit(&before.joints_rad));
-            if !(touch.within_limits && before.within_limits && limit_rad >= r.min_limit_rad) {
+            }
+            let limit_rad = before
+                .iter()
+                .map(|s| self.limit(&s.joints_rad))
+                .fold(self.limit(&touch.joints_rad), f64::min);
+            let within = touch.within_limits && before.iter().all(|s| s.within_limits);
+            if !(within && limit_rad >= r.min_limit_rad) {
                 continue;
             }
             let manipulability = self.manipulability(&touch.joints_rad).unwrap_or(0.0);
@@ -273,10 +282,15 @@ impl BaseTask<'_> {
                 reason = "singular";
                 continue;
             }
-            let Some(facing_rad) = self.facing(pair, &before.joints_rad) else {
+            let facing: Option<Vec<f64>> = before
+                .iter()
+                .map(|s| self.facing(pair, &s.joints_rad))
+                .collect();
+            let Some(facing) = facing else {
                 reason = "fiducial_hidden";
                 continue;
             };
+            let facing_rad = facing.into_iter().fold(0.0, f64::max);
             let score = manipulability.min(0.5)
                 + 0.5 * limit_rad.min(0.5)
                 + 0.5 * (1.0 - facing_rad / r.max_facing_rad);

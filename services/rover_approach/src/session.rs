@@ -2,7 +2,7 @@
 
 mod near;
 
-use crate::base_pose::{BaseChoice, Serving};
+use crate::base_pose::{BaseChoice, Serving, TargetSpot};
 use crate::drive::{DriveRules, next_movement};
 use crate::filter::{Motion, TargetEstimate};
 use crate::first_ray::{FirstRayRules, first_ray};
@@ -41,6 +41,8 @@ const MAP_STEP_PX: u32 = 16;
 const MAP_FRAMES: usize = 6;
 /// Most stops if the goal does not say.
 const MAX_STOPS_N: u32 = 60;
+/// Base poses that may be chosen anew after a look of the body cameras.
+const SECOND_CHOICES_N: u32 = 2;
 /// Stops in a row at which the target may be missed.
 const MISSES_N: u32 = 1;
 /// Largest uncertainty with which a missed target is carried on by odometry, mm, one sigma.
@@ -69,6 +71,17 @@ pub(crate) struct Session<'a> {
     missed_n: u32,
     /// The base pose that is driven to, site frame.
     aim: Option<PlanarPose>,
+    /// The target's normal as the body cameras saw it, site frame.
+    normal_in_site: Option<Vector3<f64>>,
+    /// Base poses chosen anew after a look of the body cameras.
+    second_choices_n: u32,
+}
+
+/// What came of a hand-over.
+enum Finish {
+    Reached(Box<DriveToResult>),
+    /// The target must be served from elsewhere.
+    Otherwise,
 }
 
 impl<'a> Session<'a> {
@@ -123,6 +136,8 @@ impl<'a> Session<'a> {
             shade: Shade::of(robot, &stowed_rad),
             missed_n: 0,
             aim: None,
+            normal_in_site: None,
+            second_choices_n: 0,
         };
         session.approach().await
     }
@@ -141,9 +156,10 @@ impl<'a> Session<'a> {
                         self.near_moves_n += 1;
                         arc
                     }
-                    NearStep::Stay(serving, choice) => {
-                        return self.finish(serving, choice).await;
-                    }
+                    NearStep::Stay(serving, choice) => match self.finish(serving, choice).await? {
+                        Finish::Reached(result) => return Ok(*result),
+                        Finish::Otherwise => continue,
+                    },
                 }
             };
             let limit = self.goal.limits.max_stops_n.unwrap_or(MAX_STOPS_N);
@@ -313,11 +329,7 @@ impl<'a> Session<'a> {
     }
 
     /// First ray, hand-over, and the target as the body pair sees it.
-    async fn finish(
-        &mut self,
-        serving: Serving,
-        choice: BaseChoice,
-    ) -> Result<DriveToResult, Fault> {
+    async fn finish(&mut self, serving: Serving, choice: BaseChoice) -> Result<Finish, Fault> {
         self.tell(ApproachActivity::HandingOver);
         let view = Arc::clone(&self.now.view);
         if self.spot_offset_m.is_none()
@@ -342,6 +354,13 @@ impl<'a> Session<'a> {
             .map_err(|e| fault("handover_failed", e.to_string()))?;
         self.budget.handed(&found, focal_px);
         let mut target = self.acceptable(&found.pixel_px, &found.surface).await?;
+        let spot = TargetSpot {
+            position_m: target.position_m.coords,
+            normal: target.normal.unit.into_inner(),
+        };
+        if let Err(reason) = self.served_from_here(&spot)? {
+            return self.otherwise(&target, &reason);
+        }
         let lateral = self.budget.lateral_m();
         let n = target.normal.unit.into_inner();
         let spread = (Matrix3::identity() - n * n.transpose()) * (lateral * lateral);
@@ -359,7 +378,7 @@ impl<'a> Session<'a> {
                 self.wheels.pose.roll_rad.hypot(self.wheels.pose.pitch_rad),
             ),
         ];
-        Ok(DriveToResult {
+        Ok(Finish::Reached(Box::new(DriveToResult {
             target,
             spot_offset_m: self.spot_offset_m.map(Into::into),
             budget: self.budget.shares(),
@@ -373,7 +392,21 @@ impl<'a> Session<'a> {
             },
             stops: self.stops.clone(),
             driven_m: self.driven_m,
-        })
+        })))
+    }
+
+    /// From near the surface turned out to face another way than from afar, so that the arm cannot
+    /// serve it from here: the base pose is chosen once more.
+    fn otherwise(&mut self, target: &Target, reason: &str) -> Result<Finish, Fault> {
+        if self.second_choices_n >= SECOND_CHOICES_N {
+            let message = format!("as the body cameras see the target, it is not served: {reason}");
+            return Err(fault("no_base_pose", message));
+        }
+        self.second_choices_n += 1;
+        let site_from_rover = self.wheels.pose.site_from_rover().isometry;
+        self.normal_in_site = Some(site_from_rover.rotation * target.normal.unit.into_inner());
+        self.aim = None;
+        Ok(Finish::Otherwise)
     }
 
     /// The target at the handed-over pixel; if the surface there is refused, a spot near it that is

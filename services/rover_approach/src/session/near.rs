@@ -7,7 +7,7 @@ use crate::hardware::fault;
 use crate::obstacles::{GroundMap, PlanarPose};
 use crate::service::unfit;
 use crate::surface::measure_plane;
-use nalgebra::{Point3, Vector2};
+use nalgebra::{Point3, Vector2, Vector3};
 use rover_geometry::tangent_basis;
 use rover_messages::{Fault, mobility::DriveArc};
 use std::sync::Arc;
@@ -35,21 +35,16 @@ impl Session<'_> {
         let (_, surface) = self.tracker.target();
         let spot = TargetSpot {
             position_m: self.estimate.position_m,
-            normal: surface.plane.normal,
+            normal: self.seen_normal().unwrap_or(surface.plane.normal),
         };
         let map = self.map();
         let (spot, choice) = match self.choose(&spot, &map) {
             Ok(choice) => (spot, choice),
             Err(refusal) => self.other_spot(&map).ok_or(refusal)?,
         };
-        let level = self.level_from_rover();
         let rules = BaseRules::default();
         let task = self.task(&rules)?;
-        let here = if task.shades(&spot, &level.rotation.inverse()) {
-            Err("own_shadow".to_string())
-        } else {
-            task.serve(&spot)
-        };
+        let here = self.served_from_here(&spot)?;
         let best_arm = choice.serving.iter().map(|s| s.arm_score);
         let best_arm = best_arm.fold(f64::NEG_INFINITY, f64::max);
         if let (Ok(serving), Some(best)) = (&here, choice.serving.first()) {
@@ -161,6 +156,28 @@ impl Session<'_> {
             }
         }
         None
+    }
+
+    /// How the arm serves a target, present rover frame, from where the rover stands, or the name
+    /// of the condition that is not met.
+    pub(super) fn served_from_here(
+        &self,
+        spot: &TargetSpot,
+    ) -> Result<Result<Serving, String>, Fault> {
+        let level = self.level_from_rover();
+        let rules = BaseRules::default();
+        let task = self.task(&rules)?;
+        Ok(if task.shades(spot, &level.rotation.inverse()) {
+            Err("own_shadow".to_string())
+        } else {
+            task.serve(spot)
+        })
+    }
+
+    /// The target's normal as the body cameras saw it, present rover frame.
+    fn seen_normal(&self) -> Option<Vector3<f64>> {
+        let rover_from_site = self.wheels.pose.site_from_rover().isometry.inverse();
+        Some(rover_from_site.rotation * self.normal_in_site?)
     }
 
     /// A way back, if the ground behind is known to be clear.
