@@ -18,6 +18,6 @@ pub mod observe;
 pub mod place;
 mod refusal;
 mod service;
-mod survey;
+pub mod survey;
 
 pub use service::serve;

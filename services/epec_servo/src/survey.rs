@@ -102,7 +102,8 @@ fn candidate(target: &Target, n: u32) -> ToolPose {
     }
 }
 
-fn is_visible(
+/// Whether believed kinematics reach a pose from near `q` with the whole plate in both images.
+pub fn is_visible(
     robot: &Robot,
     model: &ErrorModel,
     cameras: &StereoPair,
