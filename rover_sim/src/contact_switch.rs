@@ -63,7 +63,6 @@ pub(crate) fn insert(
 ) -> Plunger {
     let (switch, contact) = (&model.switch, &model.contact);
     let (radius, mass) = (switch.ball_radius_m, contact.plunger_mass_kg);
-    let axis = model.axis_in_link.into_inner();
     let link_from_ball = link_from_ball(model);
     // A rod of that mass, a few centimetres long.
     let inertia = Vector3::new(1e-5, 1e-5, 1e-6) * (mass / 0.02);
