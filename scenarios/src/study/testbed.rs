@@ -84,9 +84,15 @@ impl Testbed {
         let world = StillWorld::new(&self.robot, &self.description, seed)?;
         let missing = || StudyError::Shipped(format!("bluestreak has no pair {PAIR}"));
         let believed_from_true = world.pair(PAIR).ok_or_else(missing)?.believed_from_true;
+        let layout = &self.robot.description().fiducial.layout;
+        let mark = layout.point(layout.discs.len());
+        let mark = mark.ok_or_else(|| StudyError::Shipped("bluestreak has no mark".into()))?;
+        let mut model_of_mark = error_model(&self.robot);
+        model_of_mark.tool.tip_in_link = (self.robot.link_from_plate * Point3::from(mark)).coords;
         Ok(Drawn {
             robot: self.robot.clone(),
             model: error_model(&self.robot),
+            model_of_mark,
             world,
             believed_from_true,
             frames: BTreeMap::new(),
@@ -98,6 +104,8 @@ impl Testbed {
 pub struct Drawn {
     robot: Arc<Robot>,
     model: ErrorModel,
+    /// The same with the plate's central mark as the tip.
+    model_of_mark: ErrorModel,
     world: StillWorld,
     believed_from_true: Isometry3<f64>,
     /// Pictures by the bits of the joint angles that they show.
@@ -126,17 +134,32 @@ fn simulation_fault(error: &SimulationError) -> Fault {
 }
 
 impl Drawn {
-    /// The believed robot's error model.
-    pub fn model(&self) -> &ErrorModel {
-        &self.model
-    }
-
     /// The true tip where a laser tracker finds it, m.
     ///
     /// # Errors
     /// [`StudyError::Arm`] for joint angles that do not fit the arm.
     pub fn true_tip(&self, q: &[f64]) -> Result<Vector3<f64>, StudyError> {
         Ok(self.world.arm().tip_in_world(q)?)
+    }
+
+    /// Brings the plate's mark itself to a target with the vector seen of it, and measures where
+    /// it truly is, m; none if that is out of reach.
+    ///
+    /// # Errors
+    /// [`StudyError::Arm`] never, for joint angles from the inverse kinematics.
+    pub fn placed_mark(
+        &self,
+        vector: &Compensation,
+        target: &Target,
+        near: &[f64],
+    ) -> Result<Option<Vector3<f64>>, StudyError> {
+        let (at, axis) = (&target.position_m.coords, -target.normal.unit);
+        let Ok(solved) = self.model_of_mark.solve(vector, at, &axis, near) else {
+            return Ok(None);
+        };
+        let link = self.world.arm().world_from_link(&solved.joints_rad)?;
+        let mark = Point3::from(self.model_of_mark.tool.tip_in_link);
+        Ok(Some((link * mark).coords))
     }
 
     /// Turns a true direction into the one that the believed cameras see.

@@ -20,7 +20,7 @@ use serde::Serialize;
 /// Trials of one cell of the numeric cases.
 pub const TRIALS: usize = 200;
 /// One trial with images for so many without.
-const TRIALS_PER_RENDERED: usize = 20;
+const TRIALS_PER_RENDERED: usize = 25;
 /// Looks on the approach, and where it begins, m.
 const LOOKS: usize = 6;
 const START_M: f64 = 0.25;
@@ -44,7 +44,7 @@ pub enum Case {
     ImagesPlate,
     /// From images: one mark, 9 cm from the tip.
     ImagesMark,
-    /// From images: the plate, focal lengths 3 % and principal points 3 px wrong (one sigma).
+    /// From images: the mark, focal lengths 3 % and principal points 3 px wrong (one sigma).
     ImagesDegraded,
 }
 
@@ -69,7 +69,7 @@ impl Case {
             Self::Degraded => "cameras degraded until stereo is barely metric",
             Self::ImagesPlate => "images: pose of the plate",
             Self::ImagesMark => "images: one mark, 9 cm from the tip",
-            Self::ImagesDegraded => "images: pose of the plate, cameras degraded",
+            Self::ImagesDegraded => "images: one mark, cameras degraded",
         }
     }
 
@@ -245,5 +245,24 @@ mod tests {
         let study = compare(&StudyConfig::new(2, 10, None), &[Case::Behind], &[5]).unwrap();
         let of = |kind| study.median_mm(kind, Case::Behind, 5).unwrap();
         assert!((of(Kind::Epec) - of(Kind::PositionBased)).abs() < 1e-9);
+    }
+
+    #[test]
+    fn from_images_every_method_with_looks_beats_kinematics_in_full_view() {
+        let outcomes = rendered::outcomes(1, 1, Case::ImagesPlate, &[0]).unwrap();
+        let error = |kind| {
+            let (_, _, trials) = outcomes.iter().find(|o| o.1 == kind).unwrap();
+            let placed = trials[0].as_ref();
+            placed.map_or(f64::INFINITY, |o| o.error_m * 1e3)
+        };
+        let kinematic = error(Kind::Kinematic);
+        assert!(kinematic > 3.0, "{kinematic} mm");
+        for kind in Kind::ALL {
+            if kind.looks_on_approach() {
+                let error = error(kind);
+                assert!(error < 0.5 * kinematic, "{}: {error} mm", kind.name());
+            }
+        }
+        assert!((error(Kind::Epec) - error(Kind::EpecField)).abs() < 1.0);
     }
 }

@@ -92,8 +92,8 @@ impl Trial {
             stations_m: stations.collect(),
             method: kind,
             observation: match case {
-                Case::ImagesMark => Observation::Position,
-                _ => Observation::Pose,
+                Case::ImagesPlate => Observation::Pose,
+                _ => Observation::Position,
             },
             tolerance_m: ANY_M,
             max_corrections_n: 1,

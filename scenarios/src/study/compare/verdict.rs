@@ -2,6 +2,7 @@
 
 use super::{Case, Comparison, OCCLUSIONS_CM};
 use rover_methods::Kind;
+use std::fmt::Write;
 
 impl Comparison {
     /// The methods whose median is better than EPEC's by more than 2 %, best first; none if EPEC
@@ -74,13 +75,16 @@ impl Comparison {
             )
         };
         if self.methods.iter().any(|c| c.case == Case::ImagesPlate) {
-            out += &format!(
+            let _ = write!(
+                out,
                 " From images, with the pose of the plate (mm): in view {}; blind for 10 cm {}. \
-                 With one mark: {}; {}.",
+                 With one mark: {}; {}. With one mark and degraded cameras: {}; {}.",
                 blind(Case::ImagesPlate, 0),
                 blind(Case::ImagesPlate, 10),
                 blind(Case::ImagesMark, 0),
                 blind(Case::ImagesMark, 10),
+                blind(Case::ImagesDegraded, 0),
+                blind(Case::ImagesDegraded, 10),
             );
         }
         out

@@ -84,7 +84,9 @@ const SET_UP: &str = "Six looks on a straight approach of 25 cm, the last part b
     number allows. Computing times are of this machine.";
 const IMAGES: &str = "Rendered images of the testbed, drooping arm; the servo's own detector and \
     loop, so the time of a cycle contains the search for the fiducial. The target is a fiducial of \
-    the same kind, found in images too. The predicted error refuses nothing here.";
+    the same kind, found in images too. With the pose of the plate the servo's epec and \
+    epec_field correct the tool's direction as well; all other methods see the tip's position \
+    alone. The predicted error refuses nothing here.";
 
 /// A line per method, and two columns per blind part.
 fn table(lines: &[Line]) -> String {

@@ -75,7 +75,7 @@ impl Shown for Sensitivity {
              or {:.0} cm above it, as the position of one mark (the paper's fiducial) or as the \
              pose of the plate. By Jacobians: the difference of the error's derivative at the target \
              and where it was seen, and, for arm and mount, the part that is quadratic in the \
-             errors.</p>{}<div class=\"scroll\"><table><tr><th class=\"text\" rowspan=\"2\">source\
+             errors. Bars, logarithmic: orange before, blue one mark, green the plate.</p>{}<div class=\"scroll\"><table><tr><th class=\"text\" rowspan=\"2\">source\
              </th><th class=\"text\" rowspan=\"2\">one sigma</th>{head}</tr><tr>{pair}</tr>{rows}\
              </table></div>",
             self.targets,
@@ -97,8 +97,8 @@ fn bars(study: &Sensitivity) -> String {
     let height = 40.0 + ROW * study.rows.len() as f64;
     let mut out = format!(
         "<svg class=\"plot\" style=\"max-width:46rem\" viewBox=\"0 0 {} {}\" role=\"img\">\
-         <text x=\"{LEFT}\" y=\"16\" class=\"title\">mm rms, simulated: before (orange), one mark \
-         at the target (blue), plate at the target (green)</text>",
+         <text x=\"{LEFT}\" y=\"16\" class=\"title\">mm rms: before, one mark, plate at the target\
+         </text>",
         LEFT + WIDTH + 20.0,
         height + 24.0
     );
