@@ -123,7 +123,7 @@ fn table(lines: &[Line]) -> String {
         .collect();
     format!(
         "<div class=\"scroll\"><table><tr><th class=\"text\">method</th>{head}<th>images</th>\
-         <th>us a cycle</th><th>us a placement</th><th>placed</th><th class=\"text\">needs to know\
+         <th>us a cycle</th><th>us a placement</th><th>placed</th><th class=\"text\" style=\"min-width:18rem\">needs to know\
          </th></tr>{rows}</table></div>"
     )
 }
@@ -152,7 +152,7 @@ fn plot(case: Case, lines: &[Line]) -> String {
     Plot {
         title: case.name(),
         x_label: "blind for the last, cm",
-        y_label: "median, mm",
+        y_label: "mm",
         whole_x: false,
         from_zero: true,
         series,
