@@ -123,8 +123,8 @@ fn table(lines: &[Line]) -> String {
         .collect();
     format!(
         "<div class=\"scroll\"><table><tr><th class=\"text\">method</th>{head}<th>images</th>\
-         <th>us a cycle</th><th>us a placement</th><th>placed</th><th class=\"text\" style=\"min-width:18rem\">needs to know\
-         </th></tr>{rows}</table></div>"
+         <th>us a cycle</th><th>us a placement</th><th>placed</th>\
+         <th class=\"text\" style=\"min-width:18rem\">needs to know</th></tr>{rows}</table></div>"
     )
 }
 
