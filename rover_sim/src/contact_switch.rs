@@ -44,6 +44,17 @@ impl Default for Plunger {
     }
 }
 
+/// Pose of the released plunger: origin at the ball's centre, z along the approach axis.
+pub(crate) fn link_from_ball(model: &ArmModel) -> Isometry3<f64> {
+    let axis = model.axis_in_link.into_inner();
+    let turn = UnitQuaternion::rotation_between(&Vector3::z(), &axis)
+        .unwrap_or_else(|| UnitQuaternion::from_scaled_axis(Vector3::x() * std::f64::consts::PI));
+    Isometry3::from_parts(
+        (model.tip_in_link - axis * model.switch.ball_radius_m).into(),
+        turn,
+    )
+}
+
 /// Adds the plunger to the arm's last link.
 pub(crate) fn insert(
     world: &mut rp::PhysicsWorld,
@@ -52,10 +63,7 @@ pub(crate) fn insert(
 ) -> Plunger {
     let (switch, contact) = (&model.switch, &model.contact);
     let (radius, mass) = (switch.ball_radius_m, contact.plunger_mass_kg);
-    let axis = model.axis_in_link.into_inner();
-    let turn = UnitQuaternion::rotation_between(&Vector3::z(), &axis)
-        .unwrap_or_else(|| UnitQuaternion::from_scaled_axis(Vector3::x() * std::f64::consts::PI));
-    let link_from_ball = Isometry3::from_parts((model.tip_in_link - axis * radius).into(), turn);
+    let link_from_ball = link_from_ball(model);
     // A rod of that mass, a few centimetres long.
     let inertia = Vector3::new(1e-5, 1e-5, 1e-6) * (mass / 0.02);
     let properties = rp::MassProperties::new(vector(&Vector3::zeros()), mass, vector(&inertia));

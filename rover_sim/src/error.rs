@@ -53,6 +53,9 @@ pub enum SimulationError {
     /// A camera cannot draw.
     #[error("renderer: {0}")]
     Render(#[from] rover_render::RenderError),
+    /// A picture cannot be taken.
+    #[error("picture: {0}")]
+    Picture(String),
     /// A designated pixel shows nothing solid.
     #[error("pixel [{u_px}, {v_px}] of {pair}.left shows no surface")]
     NoSurface {

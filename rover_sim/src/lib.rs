@@ -15,6 +15,7 @@
 //! | `eyes` | what true cameras see |
 //! | `rover` | wheels, slip, odometry, mast: the driving rover |
 //! | `standing` | the rover on its springs while the arm works |
+//! | `still` | the true robot at rest anywhere, without physics, for studies |
 //! | `world`, `score` | all of it together, and a placement against the truth |
 //! | `hardware` | the keys on the bus |
 
@@ -31,6 +32,7 @@ mod rover;
 mod score;
 mod standing;
 mod statics;
+mod still;
 mod terrain;
 #[cfg(test)]
 mod tests;
@@ -49,6 +51,7 @@ pub use eyes::{Eyes, Moment, SurfacePoint};
 pub use hardware::Hardware;
 pub use standing::Standing;
 pub use statics::{drooped_angles_rad, gravity_torques_nm};
+pub use still::{StillArm, StillWorld};
 pub use terrain::Terrain;
-pub use truth::{TruePair, Truth};
+pub use truth::{TruePair, Truth, disturbed_camera};
 pub use world::{Advance, Collision, Touch, World};

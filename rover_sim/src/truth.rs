@@ -110,7 +110,7 @@ impl Truth {
                 let believed_from_true = about(&centre, rotation, translation);
                 let true_from_believed = believed_from_true.inverse();
                 let mut moved = |camera: &Camera, side| {
-                    disturbed(camera, &errors.intrinsics, normals(&mut lenses))
+                    disturbed_camera(camera, &errors.intrinsics, normals(&mut lenses))
                         .map_err(|message| SimulationError::Camera {
                             pair: pair.name.clone(),
                             side,
@@ -171,7 +171,10 @@ fn about(
 
 /// The camera with focal length and principal point changed by standard normal draws `[focal, u,
 /// v]` times their sigmas.
-fn disturbed(
+///
+/// # Errors
+/// What makes it no camera any more.
+pub fn disturbed_camera(
     camera: &Camera,
     errors: &IntrinsicsError,
     [focal, u, v]: [f64; 3],

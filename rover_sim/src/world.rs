@@ -22,6 +22,7 @@ use crate::{
     terrain::Terrain,
     truth::Truth,
 };
+pub(crate) use build::arm_model;
 pub(crate) use mobility::levelled;
 use motion::Record;
 use nalgebra::{Isometry3, Unit, Vector3};

@@ -220,11 +220,7 @@ impl TruthReport {
 
 /// A method's name as scenarios write it.
 pub fn method_name(method: Method) -> &'static str {
-    match method {
-        Method::Kinematic => "kinematic",
-        Method::Epec => "epec",
-        Method::EpecField => "epec_field",
-    }
+    method.name()
 }
 
 impl RunReport {

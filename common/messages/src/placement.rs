@@ -8,18 +8,8 @@ use crate::{
 use rover_compensation::Compensation;
 use serde::{Deserialize, Serialize};
 
-/// How the end-effector's position error is estimated.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Method {
-    /// Kinematics alone, no image of the arm.
-    Kinematic,
-    /// The paper's rule: the last error vector.
-    Epec,
-    /// The error vector as a field with a kinematic prior, anchored on what was seen last.
-    #[default]
-    EpecField,
-}
+/// How the end-effector's position error is estimated; written as its name in scenarios.
+pub use rover_methods::Kind as Method;
 
 /// What is observed of the fiducial.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

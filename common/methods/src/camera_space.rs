@@ -391,3 +391,81 @@ impl Method for LinearCameraSpace {
         size_of_val(self.sightings.as_slice()) + 8 * (3 + 2 * (2 + 11))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::tests::setup;
+
+    /// The pixel that the six numbers show at `x` from the origin, by the definition of the view:
+    /// `u (1 + r3.x / Z0) = r1.x + C5`, with the rows of the quaternion's rotation matrix.
+    fn shown(c: &Vector6<f64>, depth_m: f64, x: &Vector3<f64>) -> Vector2<f64> {
+        let q = Quaternion::new(c[0], -c[1], -c[2], -c[3]);
+        let scale = q.norm_squared();
+        let rotated = *UnitQuaternion::new_normalize(q)
+            .to_rotation_matrix()
+            .matrix()
+            * x;
+        let flatten = 1.0 + rotated.z / depth_m;
+        Vector2::new(
+            (scale * rotated.x + c[4]) / flatten,
+            (scale * rotated.y + c[5]) / flatten,
+        )
+    }
+
+    fn view() -> (View, Vector3<f64>) {
+        let setup = setup(0.13);
+        let target = Vector3::new(0.5, 0.05, 0.2);
+        let mut view = View::believed(&setup.cameras.left, &target).unwrap();
+        view.c += Vector6::new(0.4, -0.3, 0.5, 0.2, 3.0, -5.0);
+        (view, Vector3::new(0.03, -0.05, -0.12))
+    }
+
+    #[test]
+    fn a_pixel_that_the_view_itself_shows_leaves_no_residual() {
+        let (view, x) = view();
+        let pixel = shown(&view.c, view.depth_m, &x);
+        let [(u, _), (v, _)] = view.residuals(&x, &pixel);
+        assert!(u.abs() < 1e-9 && v.abs() < 1e-9, "{u} {v}");
+    }
+
+    #[test]
+    fn the_believed_view_agrees_with_the_believed_camera() {
+        let setup = setup(0.13);
+        for camera in [&setup.cameras.left, &setup.cameras.right] {
+            let target = Vector3::new(0.5, 0.05, 0.2);
+            let view = View::believed(camera, &target).unwrap();
+            for x in [Vector3::zeros(), Vector3::new(0.04, -0.06, -0.1)] {
+                let expected = flat_pixel(camera, &camera.project(&(target + x)).unwrap()).unwrap();
+                let apart = (shown(&view.c, view.depth_m, &x) - expected).norm();
+                assert!(apart < 1e-6, "{apart} px at {x:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_residuals_derivative_is_that_of_finite_differences() {
+        const STEP: f64 = 1e-6;
+        let (view, x) = view();
+        let pixel = Vector2::new(31.0, -17.0);
+        let derivatives = view.residuals(&x, &pixel).map(|r| r.1);
+        for k in 0..6 {
+            let moved = |step: f64| {
+                let mut c = view;
+                c.c[k] += step;
+                c.residuals(&x, &pixel).map(|r| r.0)
+            };
+            let (plus, minus) = (moved(STEP), moved(-STEP));
+            for row in 0..2 {
+                // What is differentiated is subtracted from the observation.
+                let numeric = -(plus[row] - minus[row]) / (2.0 * STEP);
+                let apart = (derivatives[row][k] - numeric).abs();
+                assert!(
+                    apart < 1e-5 * (1.0 + numeric.abs()),
+                    "row {row}, number {k}: {apart}"
+                );
+            }
+        }
+    }
+}

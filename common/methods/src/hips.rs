@@ -74,6 +74,26 @@ impl Adjustment {
         camera.transformed(&adjusted_from_believed)
     }
 
+    /// Where the adjusted camera sees a point of the arm's coordinates, px, and the derivative by
+    /// shift (m) and by a rotation vector applied on the left of the rotation (rad).
+    fn projection(
+        &self,
+        camera: &Camera,
+        point: &Vector3<f64>,
+    ) -> Result<(Vector2<f64>, Matrix2x6<f64>), MethodError> {
+        let c = *camera.model.cahv()[0];
+        let from_centre = self.rotation * (point - c - self.shift);
+        let projection = camera.project_with_jacobian(&(from_centre + c))?;
+        let mut jacobian = Matrix2x6::zeros();
+        jacobian
+            .fixed_view_mut::<2, 3>(0, 0)
+            .copy_from(&(-projection.jacobian * self.rotation.to_rotation_matrix().matrix()));
+        jacobian
+            .fixed_view_mut::<2, 3>(0, 3)
+            .copy_from(&(-projection.jacobian * from_centre.cross_matrix()));
+        Ok((projection.pixel_px, jacobian))
+    }
+
     /// One Gauss-Newton step for the sightings of one camera; `sigma_px` belongs to each.
     fn step(
         &mut self,
@@ -83,7 +103,6 @@ impl Adjustment {
         sigma_px: &[f64],
         level_deg: f64,
     ) -> Result<(), MethodError> {
-        let c = *camera.model.cahv()[0];
         let weights = Vector6::from_fn(|i, _| {
             let sigma = if i < 3 { POSITION_M } else { ROTATION_RAD };
             1.0 / (sigma * level_deg).powi(2)
@@ -93,16 +112,8 @@ impl Adjustment {
         let mut normal = Matrix6::from_diagonal(&weights);
         let mut gradient = -weights.component_mul(&now);
         for (sighting, sigma) in sightings.iter().zip(sigma_px) {
-            let from_centre = self.rotation * (sighting.predicted - c - self.shift);
-            let projection = camera.project_with_jacobian(&(from_centre + c))?;
-            let mut jacobian = Matrix2x6::zeros();
-            jacobian
-                .fixed_view_mut::<2, 3>(0, 0)
-                .copy_from(&(-projection.jacobian * self.rotation.to_rotation_matrix().matrix()));
-            jacobian
-                .fixed_view_mut::<2, 3>(0, 3)
-                .copy_from(&(-projection.jacobian * from_centre.cross_matrix()));
-            let residual = sighting.pixels[side] - projection.pixel_px;
+            let (pixel_px, jacobian) = self.projection(camera, &sighting.predicted)?;
+            let residual = sighting.pixels[side] - pixel_px;
             let weighted = jacobian.transpose() / (sigma * sigma);
             normal += weighted * jacobian;
             gradient += weighted * residual;
@@ -191,5 +202,63 @@ impl Method for Hips {
 
     fn state_bytes(&self) -> usize {
         size_of_val(self.sightings.as_slice()) + size_of_val(&self.adjusted)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+    use crate::tests::setup;
+
+    fn adjustment() -> Adjustment {
+        Adjustment {
+            shift: Vector3::new(0.012, -0.007, 0.004),
+            rotation: UnitQuaternion::from_scaled_axis(Vector3::new(0.02, -0.03, 0.015)),
+        }
+    }
+
+    /// The derivative is used as it stands in the normal equations; a wrong sign or frame in it
+    /// would still let the fit creep towards an answer.
+    #[test]
+    fn the_derivative_of_an_adjusted_camera_is_that_of_finite_differences() {
+        const STEP: f64 = 1e-6;
+        let setup = setup(0.13);
+        for camera in [&setup.cameras.left, &setup.cameras.right] {
+            for point in [
+                Vector3::new(0.5, 0.05, 0.2),
+                Vector3::new(0.42, -0.12, 0.05),
+            ] {
+                let at = adjustment();
+                let (_, jacobian) = at.projection(camera, &point).unwrap();
+                for k in 0..6 {
+                    let moved = |step: f64| {
+                        let mut a = at;
+                        if k < 3 {
+                            a.shift[k] += step;
+                        } else {
+                            let mut turn = Vector3::zeros();
+                            turn[k - 3] = step;
+                            a.rotation = UnitQuaternion::from_scaled_axis(turn) * a.rotation;
+                        }
+                        // Through the camera model itself, not through the derivative's formula.
+                        a.apply(camera).project(&point).unwrap()
+                    };
+                    let numeric = (moved(STEP) - moved(-STEP)) / (2.0 * STEP);
+                    let apart = (jacobian.column(k) - numeric).norm();
+                    assert!(apart < 1e-5 * (1.0 + numeric.norm()), "column {k}: {apart}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_adjusted_camera_shows_what_its_projection_says() {
+        let setup = setup(0.13);
+        let point = Vector3::new(0.47, 0.1, 0.15);
+        let at = adjustment();
+        let (pixel, _) = at.projection(&setup.cameras.left, &point).unwrap();
+        let shown = at.apply(&setup.cameras.left).project(&point).unwrap();
+        assert!((pixel - shown).norm() < 1e-9);
     }
 }

@@ -37,7 +37,7 @@ use serde::{Deserialize, Serialize};
 use std::{fmt::Debug, sync::Arc};
 
 /// A method with what it has learnt in one placement.
-pub trait Method: Debug + Send {
+pub trait Method: Debug + Send + Sync {
     /// Takes in one sighting of the fiducial.
     ///
     /// # Errors
@@ -59,7 +59,7 @@ pub trait Method: Debug + Send {
 }
 
 /// Which method.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Kind {
     /// Kinematics alone.
@@ -67,6 +67,7 @@ pub enum Kind {
     /// The paper's rule.
     Epec,
     /// Field with a kinematic prior, anchored on the last vector.
+    #[default]
     EpecField,
     /// The same, not anchored.
     EpecFieldFree,

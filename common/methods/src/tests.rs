@@ -13,7 +13,7 @@ use std::{f64::consts::FRAC_PI_2, sync::Arc};
 const CENTRE: Vector3<f64> = Vector3::new(0.0, 0.0, -0.3);
 
 /// The flight arm and the paper's cameras, arm base frame (z down).
-fn setup(fiducial_m: f64) -> Setup {
+pub fn setup(fiducial_m: f64) -> Setup {
     let rows = [
         [0.062443, 0.048494, FRAC_PI_2],
         [0.353552, 0.0, 0.0],

@@ -133,7 +133,7 @@ pub(super) fn arm_physics(
 }
 
 /// The true arm for rapier.
-pub(super) fn arm_model(
+pub(crate) fn arm_model(
     robot: &Robot,
     truth: &Truth,
     description: &SimulationDescription,

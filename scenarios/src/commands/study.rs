@@ -14,7 +14,11 @@ pub enum Which {
     Table1,
     /// One error vector away from the target: the paper's figure 6
     Locality,
-    /// Every method that the paper names, under the same truths and noise
+    /// The same with images of the simulated testbed: the paper's figure 7
+    Experiment,
+    /// Each error source's share in the final error, by Jacobians and by simulation
+    Sensitivity,
+    /// Every method that the paper names, under the same truths and noise, and from images
     Compare,
     /// Time and memory of a cycle of each method
     Cost,
@@ -103,6 +107,14 @@ fn study(args: &StudyArgs) -> Result<StudyReport, StudyError> {
     if all || args.which == Which::Locality {
         let trials = config(study::locality::PAPER_TRIALS);
         report.locality = Some(study::locality::locality(&trials)?);
+    }
+    if all || args.which == Which::Experiment {
+        let trials = config(study::experiment::TRIALS);
+        report.experiment = Some(study::experiment::experiment(&trials)?);
+    }
+    if all || args.which == Which::Sensitivity {
+        let trials = config(study::sensitivity::TRIALS);
+        report.sensitivity = Some(study::sensitivity::sensitivity(&trials)?);
     }
     if all || args.which == Which::Compare {
         let trials = config(study::compare::TRIALS);

@@ -170,7 +170,7 @@ impl Plot {
                     s.colour
                 );
             }
-            if self.series.len() > 1 {
+            if self.series.len() > 1 && !s.name.is_empty() {
                 let _ = write!(
                     out,
                     "<circle cx=\"{}\" cy=\"32\" r=\"4\" fill=\"{}\"/><text x=\"{}\" y=\"36\">{}</text>",

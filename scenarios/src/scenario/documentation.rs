@@ -62,7 +62,7 @@ const FIELDS: &[(&str, &str)] = &[
     ("servo", "How the instrument is brought to the standoff."),
     (
         "servo.method",
-        "\"kinematic\" (no image of the arm), \"epec\" (last error vector), \"epec_field\" (error field with kinematic prior).",
+        "How the end-effector's error is estimated. \"kinematic\" (no image of the arm), \"epec\" (last error vector), \"epec_field\" (error field with kinematic prior), \"epec_field_free\" (the same from pixels of one point, not anchored), \"hips_limited\", \"hips_full\", \"hips_approach\" (hybrid image plane/stereo), \"camera_space\", \"camera_space_linear\", \"mount_kabsch\", \"mount_map\" (camera mount), \"kinematic_calibration\", \"position_based\", \"position_based_half\", \"image_based\", \"image_based_broyden\" (visual servoing). hips_limited, hips_full, camera_space_linear, mount_map and kinematic_calibration first look at 12 poses over the view. The predicted error of every method is the error field's: its distance from what the method applies, plus its own 95 % radius.",
     ),
     (
         "servo.observation",

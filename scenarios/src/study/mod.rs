@@ -8,6 +8,8 @@
 //! |---|---|
 //! | [`table1`] | how much does one vector correct at the target, and a second one |
 //! | [`locality`] | how far from the target may the vector be taken |
+//! | [`experiment`] | the same with pictures, as in the paper's experiment |
+//! | [`sensitivity`] | how does each error source enter the final error |
 //! | [`compare`] | what do the other methods achieve |
 //! | [`cost`] | what does a cycle cost in time and memory |
 
@@ -15,10 +17,13 @@ pub mod batch;
 pub mod compare;
 pub mod cost;
 pub mod draws;
+pub mod experiment;
 pub mod locality;
 pub mod report;
+pub mod sensitivity;
 pub mod statistics;
 pub mod table1;
+pub mod testbed;
 pub mod workspace;
 pub mod world;
 
@@ -55,6 +60,15 @@ pub enum StudyError {
         /// Which study.
         what: &'static str,
     },
+    /// A shipped robot or scenario is unusable.
+    #[error("shipped files: {0}")]
+    Shipped(String),
+    /// The testbed cannot be simulated.
+    #[error(transparent)]
+    Simulation(#[from] rover_sim::SimulationError),
+    /// A camera of the testbed does not see what it should.
+    #[error("testbed: {0}")]
+    Testbed(String),
     /// The system gives no threads.
     #[error("threads: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),

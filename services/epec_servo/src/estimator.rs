@@ -108,6 +108,8 @@ pub struct Estimator {
     mean: DVector<f64>,
     covariance: DMatrix<f64>,
     last: Option<LastLook>,
+    /// What a method outside this filter applies.
+    adopted: Option<Compensation>,
 }
 
 #[derive(Clone, Debug)]
@@ -151,6 +153,7 @@ impl Estimator {
             method,
             rules,
             last: None,
+            adopted: None,
         }
     }
 
@@ -242,6 +245,12 @@ impl Estimator {
         Ok(())
     }
 
+    /// Notes what a method outside this filter makes of all that was seen; the filter goes on to
+    /// predict where the fiducial is and how far off the method's placement would be.
+    pub fn adopt(&mut self, compensation: Compensation) {
+        self.adopted = Some(compensation);
+    }
+
     /// What the method makes of all that was seen.
     pub fn compensation(&self) -> Compensation {
         match (self.method, &self.last) {
@@ -259,6 +268,7 @@ impl Estimator {
                     parameters: self.mean.rows(0, n).iter().copied().collect(),
                 }
             }
+            _ => self.adopted.clone().unwrap_or_else(Compensation::none),
         }
     }
 
@@ -285,7 +295,10 @@ impl Estimator {
 
     /// Bound that the tip's lateral error keeps in 95 % of cases when the present compensation
     /// places it at `q` on a target with position covariance `target_covariance` (m^2) and
-    /// surface normal `normal`, m. It accounts for what the method leaves uncorrected.
+    /// surface normal `normal`, m. It accounts for what the method leaves uncorrected: the
+    /// distance between the filter's best estimate of the error and what is applied, plus the
+    /// filter's own uncertainty. So it is the same measure for every method, also for those that
+    /// have no idea of their own error.
     ///
     /// # Errors
     /// [`EstimatorError::Model`] for joint angles that do not fit the arm.

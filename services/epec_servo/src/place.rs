@@ -3,16 +3,18 @@
 //! fiducial is hidden, as long as the predicted error allows it.
 
 use crate::{
+    driven::Driven,
     estimator::{Estimator, EstimatorError, EstimatorRules, Seen},
     observe::{SearchWindow, Sighting, look},
+    refusal::{compensation_fault, estimator_fault, fault, method_fault},
+    survey::{LEAST_FOUND, Survey},
 };
 use nalgebra::{Isometry3, Matrix3, Translation3, Unit, UnitQuaternion, Vector3};
-use rover_compensation::{CompensationError, ErrorModel};
+use rover_compensation::ErrorModel;
 use rover_geometry::{Direction, Rover};
 use rover_messages::{
     Fault,
     imaging::StereoFrame,
-    keys::service::EPEC_SERVO,
     placement::{Look, Method, PlaceGoal, PlaceResult},
     planning::{PlanGoal, PlanRequest, ToolPose},
 };
@@ -33,6 +35,8 @@ const SPEED_FRACTION: f64 = 0.8;
 pub enum Step {
     /// Move the arm; then ask again.
     Move(PlanRequest),
+    /// Move the arm if the planner finds a way; if not, that pose is left out. Then ask again.
+    Try(PlanRequest),
     /// Take a stereo frame with the target's pair and call [`Placement::look`]; then ask again.
     Look,
     /// The tip is at the standoff.
@@ -42,6 +46,7 @@ pub enum Step {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
     Start,
+    Surveying,
     Arrived,
     Looked,
 }
@@ -52,6 +57,9 @@ pub struct Placement {
     robot: Arc<Robot>,
     goal: PlaceGoal,
     estimator: Estimator,
+    /// The method, where it is not one of the estimator's own.
+    driven: Option<Driven>,
+    survey: Survey,
     station: usize,
     phase: Phase,
     looks: Vec<Look>,
@@ -69,24 +77,6 @@ pub fn error_model(robot: &Robot) -> ErrorModel {
     }
 }
 
-fn fault(name: &str, message: impl Into<String>) -> Fault {
-    Fault::new(EPEC_SERVO, name, message)
-}
-
-fn compensation_fault(error: &CompensationError) -> Fault {
-    match error {
-        CompensationError::Unreachable(e) => fault(
-            "corrected_pose_out_of_reach",
-            format!("{e}; choose another target"),
-        ),
-        other => fault("internal", other.to_string()),
-    }
-}
-
-fn estimator_fault(error: &EstimatorError) -> Fault {
-    fault("internal", error.to_string())
-}
-
 impl Placement {
     /// A placement that has not moved yet.
     pub fn new(robot: Arc<Robot>, goal: PlaceGoal, rules: EstimatorRules) -> Self {
@@ -98,8 +88,18 @@ impl Placement {
             quality.length_mm * 1e-3,
             rules,
         );
+        let driven = match goal.method {
+            Method::Kinematic | Method::Epec | Method::EpecField => None,
+            other => Some(Driven::new(
+                other,
+                &goal.target.position_m.coords,
+                &goal.target.normal.unit,
+            )),
+        };
         Self {
             robot,
+            driven,
+            survey: Survey::new(goal.method.initial_poses()),
             goal,
             estimator,
             station: 0,
@@ -134,7 +134,15 @@ impl Placement {
     /// to the first station.
     pub fn next(&mut self, q: &[f64]) -> Result<Step, Fault> {
         match self.phase {
+            Phase::Surveying => Ok(Step::Look),
             Phase::Start => {
+                if let Some(pose) = self.next_survey_pose(q)? {
+                    self.phase = Phase::Surveying;
+                    let visible_to = Some(self.goal.target.pair.clone());
+                    let mut request = self.request(PlanGoal::Tool { pose, visible_to });
+                    request.contact_radius_m = 0.0;
+                    return Ok(Step::Try(request));
+                }
                 self.phase = Phase::Arrived;
                 let pose = self.command(q)?;
                 let visible_to = Some(self.goal.target.pair.clone());
@@ -142,13 +150,51 @@ impl Placement {
                     self.request(PlanGoal::Tool { pose, visible_to }),
                 ))
             }
-            Phase::Arrived if self.goal.method != Method::Kinematic => Ok(Step::Look),
+            Phase::Arrived if self.goal.method.looks_on_approach() => Ok(Step::Look),
             Phase::Arrived | Phase::Looked => self.advance(q),
         }
     }
 
+    /// The pose of the last [`Step::Try`] is left out.
+    pub fn leave_out(&mut self) {
+        self.phase = Phase::Start;
+    }
+
+    fn next_survey_pose(&mut self, q: &[f64]) -> Result<Option<ToolPose>, Fault> {
+        let target = &self.goal.target;
+        let pair = self
+            .robot
+            .pair(&target.pair)
+            .map_err(|e| fault("unknown_camera_pair", e.to_string()))?;
+        let model = self.estimator.model();
+        let next = self
+            .survey
+            .next(&self.robot, model, &pair.cameras, target, q);
+        if next.is_none() && !self.survey.is_enough() {
+            return Err(fault(
+                "too_few_initial_looks",
+                format!(
+                    "{} wants the fiducial seen at {} poses before the approach; found at {}, \
+                     expected at least {LEAST_FOUND}; last look: {}",
+                    self.goal.method.name(),
+                    self.goal.method.initial_poses(),
+                    self.survey.found(),
+                    self.last_reason()
+                ),
+            ));
+        }
+        Ok(next)
+    }
+
+    fn last_reason(&self) -> String {
+        self.looks
+            .last()
+            .and_then(|l| l.reason.clone())
+            .unwrap_or_default()
+    }
+
     fn advance(&mut self, q: &[f64]) -> Result<Step, Fault> {
-        let found = self.looks.last().is_some_and(|l| l.found);
+        let found = self.phase == Phase::Looked && self.looks.last().is_some_and(|l| l.found);
         if self.station + 1 < self.goal.stations_m.len() {
             if !found {
                 self.check_predicted_error(q)?;
@@ -205,12 +251,24 @@ impl Placement {
     /// `fiducial_inconsistent` when several looks in a row contradict all that is known. A
     /// fiducial that is merely not found is no error: it is noted in the returned look.
     pub fn look(&mut self, q: &[f64], frame: &StereoFrame) -> Result<Look, Fault> {
-        self.phase = Phase::Looked;
+        let is_survey = self.phase == Phase::Surveying;
         let kinematic = self
             .estimator
             .model()
             .rover_from_link(q)
             .map_err(|e| compensation_fault(&e.into()))?;
+        let station_m = if is_survey {
+            let tip = kinematic.transform_point(&self.robot.tool.tip_in_link.into());
+            self.normal()
+                .dot(&(tip.coords - self.goal.target.position_m.coords))
+        } else {
+            self.station_m()
+        };
+        self.phase = if is_survey {
+            Phase::Start
+        } else {
+            Phase::Looked
+        };
         let (predicted, window) = self.predicted_link(q, &kinematic)?;
         let outcome = look(
             &self.robot,
@@ -220,12 +278,18 @@ impl Placement {
             &kinematic,
             window,
         )
-        .and_then(|sighting| self.take_in(q, &sighting).map(|()| sighting));
+        .and_then(|sighting| {
+            self.take_in(q, frame, &sighting, is_survey)
+                .map(|()| sighting)
+        });
+        if is_survey && outcome.is_ok() {
+            self.survey.count();
+        }
         let vector = |v: Vector3<f64>| -> [f64; 3] { v.into() };
         let look = Look {
             sim_time_s: frame.images.sim_time_s,
             step: frame.images.step,
-            station_m: self.station_m(),
+            station_m,
             found: outcome.is_ok(),
             reason: outcome.as_ref().err().cloned(),
             error_vector_m: outcome
@@ -268,19 +332,29 @@ impl Placement {
         Ok(self.request(PlanGoal::Straight(vec![pose])))
     }
 
-    fn take_in(&mut self, q: &[f64], sighting: &Sighting) -> Result<(), String> {
-        match self.estimator.observe(q, &sighting.seen) {
-            Ok(()) => {
-                self.inconsistent = 0;
-                Ok(())
+    /// The filter judges every sighting; what it accepts goes to the method.
+    fn take_in(
+        &mut self,
+        q: &[f64],
+        frame: &StereoFrame,
+        sighting: &Sighting,
+        is_survey: bool,
+    ) -> Result<(), String> {
+        if let Err(error) = self.estimator.observe(q, &sighting.seen) {
+            if matches!(error, EstimatorError::Inconsistent { .. }) {
+                self.inconsistent += 1;
             }
-            Err(error) => {
-                if matches!(error, EstimatorError::Inconsistent { .. }) {
-                    self.inconsistent += 1;
-                }
-                Err(error.to_string())
-            }
+            return Err(error.to_string());
         }
+        self.inconsistent = 0;
+        let station_m = self.station_m();
+        if let Some(driven) = &mut self.driven {
+            let reference = (!is_survey).then(|| driven.reference(station_m));
+            driven.observe(&self.robot, &frame.cameras, q, sighting, reference)?;
+            let at_target = driven.at_target(q).map_err(|e| e.to_string())?;
+            self.estimator.adopt(at_target);
+        }
+        Ok(())
     }
 
     /// The last link's pose with the filter's best estimate of its error, and the window that
@@ -323,6 +397,16 @@ impl Placement {
     /// The pose to command so that the tip is seen at the present station.
     fn command(&self, q: &[f64]) -> Result<ToolPose, Fault> {
         let normal = self.normal();
+        if let Some(driven) = &self.driven {
+            let reference = driven.reference(self.station_m());
+            let tip = driven
+                .command(&reference, q)
+                .map_err(|e| method_fault(self.goal.method, &e))?;
+            return Ok(ToolPose {
+                tip_m: tip.into(),
+                axis: Direction::<Rover>::from(reference.axis_in_rover),
+            });
+        }
         let reference = self.goal.target.position_m.coords + normal.into_inner() * self.station_m();
         let solved = self
             .estimator
@@ -371,11 +455,7 @@ impl Placement {
         if self.goal.method == Method::Kinematic || predicted <= limit {
             return Ok(predicted);
         }
-        let why = self
-            .looks
-            .last()
-            .and_then(|l| l.reason.clone())
-            .unwrap_or_default();
+        let why = self.last_reason();
         let name = if self.estimator.has_seen() {
             "predicted_error_too_large"
         } else {

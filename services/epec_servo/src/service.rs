@@ -9,7 +9,10 @@ use rover_messages::{
     Fault,
     arm::Guard,
     imaging::{CaptureRequest, StereoFrame},
-    keys::{self, service::EPEC_SERVO},
+    keys::{
+        self,
+        service::{ARM_PLANNER, EPEC_SERVO},
+    },
     placement::{Look, PlaceFeedback, PlaceGoal, PlaceResult},
 };
 use rover_robot::Robot;
@@ -92,29 +95,18 @@ impl Servo {
                 return Err(interrupted(EPEC_SERVO, &interrupt));
             }
             let q = self.arm.state().await?.joints_rad;
-            match placement.next(&q)? {
+            let plan = match placement.next(&q)? {
                 Step::Done(result) => return Ok(result),
-                Step::Move(request) => {
-                    let plan = self.arm.plan(&request).await?;
-                    let result = self
-                        .arm
-                        .execute(&plan, Guard::default(), context, |state| {
-                            if let Ok(distance_m) = placement.distance_m(&state.joints_rad) {
-                                let activity = "moving".into();
-                                let look = last_look.clone();
-                                context.feedback(PlaceFeedback {
-                                    activity,
-                                    distance_m,
-                                    look,
-                                });
-                            }
-                        })
-                        .await?;
-                    if !result.completed {
-                        return Err(unexpected_stop(&result));
+                Step::Try(request) => match self.arm.plan(&request).await {
+                    Ok(plan) => plan,
+                    Err(refusal) if refusal.service == ARM_PLANNER => {
+                        tracing::info!(%refusal, "a pose before the approach is left out");
+                        placement.leave_out();
+                        continue;
                     }
-                    self.shell.count("moves");
-                }
+                    Err(fault) => return Err(fault),
+                },
+                Step::Move(request) => self.arm.plan(&request).await?,
                 Step::Look => {
                     let frame: StereoFrame = self
                         .peer
@@ -142,8 +134,27 @@ impl Servo {
                         distance_m,
                         look,
                     });
+                    continue;
                 }
+            };
+            let result = self
+                .arm
+                .execute(&plan, Guard::default(), context, |state| {
+                    if let Ok(distance_m) = placement.distance_m(&state.joints_rad) {
+                        let activity = "moving".into();
+                        let look = last_look.clone();
+                        context.feedback(PlaceFeedback {
+                            activity,
+                            distance_m,
+                            look,
+                        });
+                    }
+                })
+                .await?;
+            if !result.completed {
+                return Err(unexpected_stop(&result));
             }
+            self.shell.count("moves");
         }
     }
 

@@ -1,0 +1,159 @@
+//! Images of the testbed, the servo's detector and the servo's loop: each method as a scenario would
+//! run it, without the time that motions take.
+
+use super::{Case, LOOKS, Outcome, Outcomes, START_M};
+use crate::study::{
+    StudyError,
+    draws::{Draws, key},
+    testbed::{Drawn, PAIR, Testbed},
+};
+use nalgebra::{Unit, Vector3};
+use rayon::prelude::*;
+use rover_epec_servo::{estimator::EstimatorRules, place::error_model, survey::is_visible};
+use rover_geometry::{Direction, Rover};
+use rover_messages::{
+    placement::{Observation, PlaceGoal},
+    planning::ToolPose,
+    target::Target,
+};
+use rover_methods::Kind;
+use rover_sim::IntrinsicsError;
+
+/// The degraded pair: focal length as a fraction, principal point in px, one sigma.
+const DEGRADED: IntrinsicsError = IntrinsicsError {
+    focal_fraction: 0.03,
+    principal_point_px: 3.0,
+};
+/// Tilt of the target's normal from the vertical, per axis, one sigma, rad.
+const TILT: f64 = 0.1;
+/// Tolerance that ends the servo's loop with its first look at a station, m.
+const ANY_M: f64 = 0.1;
+/// No placement is refused for what is predicted of it.
+const NO_LIMIT_M: f64 = 1.0;
+/// Places tried for a target that is seen from start to end.
+const MOST_PLACES: u32 = 2000;
+
+/// What is common to all methods and blind parts of a trial.
+struct Trial {
+    drawn: Drawn,
+    at: Vector3<f64>,
+    normal: Unit<Vector3<f64>>,
+    target: Target,
+}
+
+impl Trial {
+    fn draw(bed: &Testbed, seed: u64, trial: u64) -> Result<Self, StudyError> {
+        let failed = |e: String| StudyError::Testbed(e);
+        let mut drawn = bed.draw(key(seed, &[6, trial]))?;
+        let pair = bed.robot.pair(PAIR).map_err(|e| failed(e.to_string()))?;
+        let model = error_model(&bed.robot);
+        let start = drawn.start()?;
+        let mut draws = Draws::new(seed, &[7, trial]);
+        for _ in 0..MOST_PLACES {
+            let at = Vector3::new(
+                draws.between(0.44, 0.62),
+                draws.between(-0.15, 0.15),
+                draws.between(0.15, 0.32),
+            );
+            let tilted = Vector3::new(TILT * draws.normal(), TILT * draws.normal(), 1.0);
+            let normal = Unit::new_normalize(tilted);
+            let sees = |distance: f64| {
+                let pose = ToolPose {
+                    tip_m: (at + normal.into_inner() * distance).into(),
+                    axis: Direction::<Rover>::from(-normal),
+                };
+                is_visible(&bed.robot, &model, &pair.cameras, &pose, &start)
+            };
+            if !(sees(0.0) && sees(START_M)) {
+                continue;
+            }
+            if let Ok(target) = drawn.target(&at, &normal) {
+                return Ok(Self {
+                    drawn,
+                    at,
+                    normal,
+                    target,
+                });
+            }
+        }
+        Err(StudyError::NoTrials {
+            what: "compare: no target is seen from start to end",
+        })
+    }
+
+    fn place(&mut self, kind: Kind, case: Case, occlusion_cm: u32) -> Option<Outcome> {
+        let blind_m = f64::from(occlusion_cm) * 0.01;
+        let stations = (0..LOOKS).map(|k| {
+            let gone = k as f64 / (LOOKS - 1) as f64;
+            START_M + (blind_m - START_M) * gone
+        });
+        let goal = PlaceGoal {
+            target: self.target.clone(),
+            stations_m: stations.collect(),
+            method: kind,
+            observation: match case {
+                Case::ImagesPlate => Observation::Pose,
+                _ => Observation::Position,
+            },
+            tolerance_m: ANY_M,
+            max_corrections_n: 1,
+            max_predicted_error_m: NO_LIMIT_M,
+        };
+        // What the detector finds counts: with wrong lenses no sighting agrees with a filter
+        // that takes them for right, and the methods shall be compared, not the filter.
+        let rules = EstimatorRules {
+            gate_per_row: f64::INFINITY,
+            ..EstimatorRules::default()
+        };
+        let placed = self.drawn.place(&goal, rules).ok()?;
+        let tip = self.drawn.true_tip(&placed.joints_rad).ok()?;
+        let error = tip - self.at;
+        let normal = self.normal.into_inner();
+        let error_m = error.norm();
+        error_m.is_finite().then(|| Outcome {
+            error_m,
+            lateral_m: (error - normal * error.dot(&normal)).norm(),
+            cycle_us: placed.computing_us / f64::from(placed.cycles.max(1)),
+            placement_us: placed.computing_us,
+        })
+    }
+}
+
+/// Runs one case.
+///
+/// # Errors
+/// [`StudyError`].
+pub fn outcomes(
+    seed: u64,
+    trials: usize,
+    case: Case,
+    occlusions_cm: &[u32],
+) -> Result<Vec<Outcomes>, StudyError> {
+    let intrinsics = match case {
+        Case::ImagesDegraded => DEGRADED,
+        _ => IntrinsicsError::default(),
+    };
+    let bed = Testbed::bluestreak(intrinsics)?;
+    let combinations: Vec<(u32, Kind)> = occlusions_cm
+        .iter()
+        .flat_map(|g| Kind::ALL.map(|kind| (*g, kind)))
+        .collect();
+    let by_trial: Vec<Vec<Option<Outcome>>> = (0..trials)
+        .into_par_iter()
+        .map(|trial| {
+            let mut trial = Trial::draw(&bed, seed, trial as u64)?;
+            Ok(combinations
+                .iter()
+                .map(|(g, kind)| trial.place(*kind, case, *g))
+                .collect())
+        })
+        .collect::<Result<_, StudyError>>()?;
+    Ok(combinations
+        .iter()
+        .enumerate()
+        .map(|(i, (g, kind))| {
+            let outcomes = by_trial.iter().map(|t| t[i].clone()).collect();
+            (*g, *kind, outcomes)
+        })
+        .collect())
+}
