@@ -99,6 +99,7 @@ mod tests {
 
     fn score(contact_in_world_m: Option<[f64; 3]>) -> Score {
         Score {
+            believed_in_world_m: [0.0; 3],
             target_in_world_m: [0.5, 0.0, 0.4],
             normal_in_world: [0.0, 0.0, 1.0],
             contact_in_world_m,
