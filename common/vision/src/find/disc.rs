@@ -74,7 +74,7 @@ impl Default for DiscRules {
             min_axis_ratio: 0.3,
             max_fill_error: 0.06,
             min_contrast_dn: 30.0,
-            min_score: 0.965,
+            min_score: 0.98,
             max_residual_fraction: 0.05,
             noise_dn: 6.0,
             max_blur_px: 1.6,

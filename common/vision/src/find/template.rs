@@ -176,7 +176,7 @@ const SETTLED_PX: f64 = 0.002;
 /// Room around the patch that the fit may use, px.
 const ROOM_PX: u32 = 12;
 
-/// Affine least-squares matching from a peak. Derivatives are the template's, so that their noise
+/// Affine least-squares matching from a peak, with gain, offset and a ramp of light. Derivatives are the template's, so that their noise
 /// is independent of the image's.
 fn refine(
     image: &Image8,
@@ -209,9 +209,10 @@ fn refine(
     let corner = Vector2::new(f64::from(left), f64::from(top));
     let scale = 1.0 / half_u.max(half_v).max(1.0);
 
-    // slopes by u, v and the four affine elements, then value and one, where the patch has them
+    // slopes by u, v and the four affine elements, then value, one and a ramp of light (x, y),
+    // where the patch has them
     let on = |i: usize, j: usize| patch.mask.as_ref().is_none_or(|m| m[j * w + i]);
-    let mut rows: Vec<(usize, SVector<f64, 8>)> = Vec::with_capacity(w * h);
+    let mut rows: Vec<(usize, SVector<f64, 10>)> = Vec::with_capacity(w * h);
     for j in 1..h.saturating_sub(1) {
         for i in 1..w.saturating_sub(1) {
             if !(on(i, j) && on(i - 1, j) && on(i + 1, j) && on(i, j - 1) && on(i, j + 1)) {
@@ -221,11 +222,11 @@ fn refine(
             let gu = 0.5 * (at(i + 1, j) - at(i - 1, j));
             let gv = 0.5 * (at(i, j + 1) - at(i, j - 1));
             let (x, y) = ((i as f64 - half_u) * scale, (j as f64 - half_v) * scale);
-            let row = [gu, gv, gu * x, gu * y, gv * x, gv * y, at(i, j), 1.0];
+            let row = [gu, gv, gu * x, gu * y, gv * x, gv * y, at(i, j), 1.0, x, y];
             rows.push((j * w + i, SVector::from(row)));
         }
     }
-    let mut normal = SMatrix::<f64, 8, 8>::zeros();
+    let mut normal = SMatrix::<f64, 10, 10>::zeros();
     for (_, row) in &rows {
         normal.ger(1.0, row, row, 1.0);
     }
@@ -269,7 +270,7 @@ fn refine(
         if !inside {
             return border_peak(patch, peak, patch_variance, &rows, rules).ok_or_else(outside);
         }
-        let mut right_side = SVector::<f64, 8>::zeros();
+        let mut right_side = SVector::<f64, 10>::zeros();
         let (mut sum, mut squares) = (0.0, 0.0);
         for (k, row) in &rows {
             let y = f64::from(samples[*k]);
@@ -315,7 +316,7 @@ fn refine(
             let cross = right_side[6] - mean * sum;
             let variance = squares - sum * sum / n;
             let score = cross / (patch_variance * variance).max(1e-12).sqrt();
-            let residual = (squares - x.dot(&right_side)).max(0.0) / (n - 8.0).max(1.0);
+            let residual = (squares - x.dot(&right_side)).max(0.0) / (n - 10.0).max(1.0);
             let inverse = factor.inverse();
             let spread = 0.5 * (inverse[(0, 0)] + inverse[(1, 1)]);
             // the template carries noise of its own: both images count
@@ -344,7 +345,7 @@ fn border_peak(
     patch: &Patch,
     peak: &Peak,
     variance: f64,
-    rows: &[(usize, SVector<f64, 8>)],
+    rows: &[(usize, SVector<f64, 10>)],
     rules: &TemplateRules,
 ) -> Option<Finding> {
     let slopes: f64 = rows.iter().map(|(_, r)| r[0] * r[0] + r[1] * r[1]).sum();
