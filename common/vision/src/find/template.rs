@@ -4,6 +4,7 @@
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 use serde::{Deserialize, Serialize};
 
+use super::pixels::noise_dn;
 use super::warp::{Appearance, Patch, warp};
 use super::{Finding, NoFinding, cut, near, positive};
 use crate::image::{Image8, ImageF};
@@ -16,6 +17,9 @@ use crate::sample::SplineImage;
 pub struct TemplateRules {
     /// Least NCC, in the search and after refinement.
     pub min_score: f64,
+    /// Least NCC after refinement, freed of what the grey noise of image and picture takes off it:
+    /// how alike the surfaces are, however noisy they are seen.
+    pub min_similarity: f64,
     /// Largest NCC of any other place, as a fraction of the best one's.
     pub uniqueness_ratio: f64,
     /// Resolutions of the search; 1 correlates at full resolution only.
@@ -36,6 +40,7 @@ impl Default for TemplateRules {
     fn default() -> Self {
         Self {
             min_score: 0.7,
+            min_similarity: 0.9,
             uniqueness_ratio: 0.9,
             levels: 3,
             affine: true,
@@ -51,6 +56,7 @@ impl TemplateRules {
     fn validate(&self) -> Result<(), NoFinding> {
         for (name, x) in [
             ("min_score", self.min_score),
+            ("min_similarity", self.min_similarity),
             ("uniqueness_ratio", self.uniqueness_ratio),
             ("levels", self.levels as f64),
             ("max_correction_px", self.max_correction_px),
@@ -82,7 +88,9 @@ pub fn template(
         mask: None,
         offset: Vector2::zeros(),
     };
-    find(image, &patch, window, rules)
+    let whole = Window::whole(picture);
+    let noises = [noise_dn(image, window), noise_dn(picture, whole)];
+    find(image, &patch, window, noises, rules)
 }
 
 /// Finds a flat picture within `radius_px` of where its predicted appearance puts it, comparing the
@@ -110,7 +118,9 @@ pub fn warped_template(
         top: high.top,
         height: high.height,
     };
-    find(image, &patch, window, rules)
+    let whole = Window::whole(picture);
+    let noises = [noise_dn(image, window), noise_dn(picture, whole)];
+    find(image, &patch, window, noises, rules)
 }
 
 /// Peaks closer than this are one place, px.
@@ -120,6 +130,7 @@ fn find(
     image: &Image8,
     patch: &Patch,
     window: Window,
+    noises_dn: [f64; 2],
     rules: &TemplateRules,
 ) -> Result<Finding, NoFinding> {
     image.validate()?;
@@ -157,7 +168,7 @@ fn find(
             limit: rules.uniqueness_ratio,
         });
     }
-    let found = refine(image, patch, best, rules)?;
+    let found = refine(image, patch, best, noises_dn, rules)?;
     if found.score < rules.min_score {
         return Err(low(found.score));
     }
@@ -182,6 +193,7 @@ fn refine(
     image: &Image8,
     patch: &Patch,
     peak: &Peak,
+    noises_dn: [f64; 2],
     rules: &TemplateRules,
 ) -> Result<Finding, NoFinding> {
     let (w, h) = (patch.width, patch.height);
@@ -316,6 +328,17 @@ fn refine(
             let cross = right_side[6] - mean * sum;
             let variance = squares - sum * sum / n;
             let score = cross / (patch_variance * variance).max(1e-12).sqrt();
+            let [image_part, patch_part] = [
+                signal_part(variance / n, noises_dn[0]),
+                signal_part(patch_variance / n, noises_dn[1]),
+            ];
+            let similarity = score / (image_part * patch_part).sqrt();
+            if !(similarity >= rules.min_similarity) {
+                return Err(NoFinding::LowScore {
+                    score: similarity,
+                    limit: rules.min_similarity,
+                });
+            }
             let residual = (squares - x.dot(&right_side)).max(0.0) / (n - 10.0).max(1.0);
             let inverse = factor.inverse();
             let spread = 0.5 * (inverse[(0, 0)] + inverse[(1, 1)]);
@@ -337,6 +360,14 @@ fn refine(
     })
 }
 
+/// Noise is never held responsible for more than this part of a window's variance.
+const MOST_NOISE: f64 = 0.6;
+
+/// The part of a window's variance that is not noise.
+fn signal_part(variance: f64, noise_dn: f64) -> f64 {
+    1.0 - (noise_dn * noise_dn / variance.max(1e-9)).min(MOST_NOISE)
+}
+
 /// Sigma granted to a peak at the image border, which cannot be fitted, px.
 const UNFITTED_SIGMA_PX: f64 = 0.15;
 
@@ -352,7 +383,7 @@ fn border_peak(
     let noise = variance * (1.0 / (peak.score * peak.score) - 1.0).max(0.0) / rows.len() as f64;
     let sigma = (noise * 2.0 / slopes.max(1e-9)).sqrt();
     let sigma = (sigma * sigma + UNFITTED_SIGMA_PX * UNFITTED_SIGMA_PX).sqrt();
-    (sigma <= rules.max_sigma_px).then(|| {
+    (sigma <= rules.max_sigma_px && peak.score >= rules.min_similarity).then(|| {
         Finding::at(
             peak.u_px + patch.offset.x,
             peak.v_px + patch.offset.y,

@@ -17,7 +17,7 @@ use rover_vision::harris::HarrisRules;
 use rover_vision::ncc::Window;
 use rover_vision::texture::texture;
 
-use super::patch::{self, FOCAL_PX, Light};
+use super::patch::{self, EDGES, FOCAL_PX, Light};
 
 /// How a trial ended. Without an error nothing was accepted.
 pub struct Outcome {
@@ -163,14 +163,14 @@ fn scene(
     rng: &mut ChaCha8Rng,
     noise_dn: f64,
     side_px: u32,
-    max_turn_rad: f64,
     shade: &dyn Fn(f64, f64) -> Option<f64>,
+    samples: patch::Samples,
 ) -> Option<(Camera, Image8, Isometry3<f64>, Vector2<f64>)> {
     let camera = patch::camera(side_px, side_px, Vector3::zeros(), 0.0);
-    let pose = patch::pose(rng, MAX_TILT_RAD, max_turn_rad);
+    let pose = patch::pose(rng, MAX_TILT_RAD, std::f64::consts::PI);
     let light = Light::random(rng);
     let ground = ground(rng);
-    let picture = patch::draw(&camera, &pose, shade, &ground);
+    let picture = patch::draw(&camera, &pose, shade, &ground, samples);
     let image = patch::expose(&picture, side_px, &light, noise_dn, rng)?;
     let truth = patch::seen(&camera, &pose, 0.0, 0.0)?;
     Some((camera, image, pose, truth))
@@ -197,7 +197,7 @@ fn harris(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
     let light = Light::random(rng);
     let seed: u64 = rng.random::<u64>() >> 1;
     let shade = move |x: f64, y: f64| Some(texture(x, y, 0.03, 0.002, 25.0, seed));
-    let picture = patch::draw(&camera, &pose, &shade, &|_, _| 110.0);
+    let picture = patch::draw(&camera, &pose, &shade, &|_, _| 110.0, patch::SMOOTH);
     let mut corners = |noise_dn: f64| {
         let image = patch::expose(&picture, SIDE_PX, &light, noise_dn, rng)?;
         find::harris(&image, Window::whole(&image), &HarrisRules::default()).ok()
@@ -297,7 +297,7 @@ fn warped(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
         (x.abs().max(y.abs()) < half)
             .then(|| at((x + half) * per_m - 0.5, (half - y) * per_m - 0.5))
     };
-    let made = scene(rng, noise_dn, SIDE_PX, std::f64::consts::PI, &shade);
+    let made = scene(rng, noise_dn, SIDE_PX, &shade, patch::SMOOTH);
     let pixels = (0..PICTURE_PX * PICTURE_PX)
         .map(|i| {
             let x = at(f64::from(i % PICTURE_PX), f64::from(i / PICTURE_PX));
@@ -347,9 +347,7 @@ fn disc(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
             }
         })
     };
-    let Some((camera, image, pose, truth)) =
-        scene(rng, noise_dn, SIDE_PX, std::f64::consts::PI, &shade)
-    else {
+    let Some((camera, image, pose, truth)) = scene(rng, noise_dn, SIDE_PX, &shade, EDGES) else {
         return Outcome::MISSED;
     };
     let known = DiscTruth {
@@ -373,8 +371,7 @@ fn saddle(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
     let shade = |x: f64, y: f64| {
         (x.abs().max(y.abs()) < 0.02).then_some(if x * y > 0.0 { BLACK_DN } else { WHITE_DN })
     };
-    let Some((_, image, _, truth)) = scene(rng, noise_dn, SIDE_PX, std::f64::consts::PI, &shade)
-    else {
+    let Some((_, image, _, truth)) = scene(rng, noise_dn, SIDE_PX, &shade, EDGES) else {
         return Outcome::MISSED;
     };
     nearest(
@@ -412,8 +409,7 @@ fn apriltag(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
         let light = row.as_bytes().get(i as usize) == Some(&b'1');
         Some(if light { WHITE_DN } else { BLACK_DN })
     };
-    let Some((_, image, _, truth)) = scene(rng, noise_dn, SIDE_PX, std::f64::consts::PI, &shade)
-    else {
+    let Some((_, image, _, truth)) = scene(rng, noise_dn, SIDE_PX, &shade, EDGES) else {
         return Outcome::MISSED;
     };
     let whole = Window::whole(&image);
