@@ -228,6 +228,9 @@ pub(super) fn noise_dn(image: &Image8, window: Window) -> f64 {
 const MAX_STEPS: usize = 25;
 /// A fit has settled when its step moves the centre by less, px.
 const SETTLED_PX: f64 = 0.002;
+/// After so many steps a fit that explains less than half of the grey values' variance is given up.
+const PATIENCE: usize = 5;
+const HOPELESS_SCORE: f64 = std::f64::consts::FRAC_1_SQRT_2;
 /// Grey values from here on count as clipped, DN.
 const SATURATION_DN: u8 = 254;
 /// Quantisation alone has this standard deviation, DN.
@@ -372,7 +375,7 @@ pub(super) fn fit_pixels<const N: usize, M: PixelModel<N>>(
         gain: 0.0,
     };
     let size = N + LINEAR;
-    for _ in 0..MAX_STEPS {
+    for round in 0..MAX_STEPS {
         let sums = accumulate(image, model, &p, light, 0)?;
         let weight = sums.matrix[(size - 1, size - 1)];
         if weight < MIN_WEIGHT_PX {
@@ -390,6 +393,17 @@ pub(super) fn fit_pixels<const N: usize, M: PixelModel<N>>(
         if !x.iter().all(|x| x.is_finite()) || gain == 0.0 {
             return Err(diverged(&p));
         }
+        let grey = sums.matrix[(size, size)];
+        let sum = sums.matrix[(size - 1, size)];
+        let residual = (grey - x.dot(&right)).max(0.0);
+        let total = grey - sum * sum / weight;
+        let score = (1.0 - residual / total.max(1e-9)).max(0.0).sqrt();
+        if round >= PATIENCE && score < HOPELESS_SCORE {
+            return Err(NoFinding::LowScore {
+                score,
+                limit: HOPELESS_SCORE,
+            });
+        }
         let mut step = [0.0; N];
         for (s, x) in step.iter_mut().zip(x.iter()) {
             *s = x / gain;
@@ -402,10 +416,6 @@ pub(super) fn fit_pixels<const N: usize, M: PixelModel<N>>(
         let (du, dv) = (p[0] - before[0], p[1] - before[1]);
         let rest = (2..N).fold(0.0f64, |m, i| m.max((p[i] - before[i]).abs()));
         if (du * du + dv * dv).sqrt() < SETTLED_PX && rest < 0.01 {
-            let grey = sums.matrix[(size, size)];
-            let sum = sums.matrix[(size - 1, size)];
-            let residual = (grey - x.dot(&right)).max(0.0);
-            let total = grey - sum * sum / weight;
             let freedom = (weight - size as f64).max(1.0);
             let rms_dn = (residual / freedom).sqrt();
             let inverse = factor.inverse();
@@ -413,7 +423,7 @@ pub(super) fn fit_pixels<const N: usize, M: PixelModel<N>>(
             return Ok(PixelFit {
                 parameters: p,
                 gain_dn: gain,
-                score: (1.0 - residual / total.max(1e-9)).max(0.0).sqrt(),
+                score,
                 rms_dn,
                 freedom,
                 light,
