@@ -11,7 +11,7 @@ use rover_cameras::Camera;
 use serde::{Deserialize, Serialize};
 
 use super::blobs::{Blob, BlobRules, blobs};
-use super::pixels::{PixelModel, fit_pixels};
+use super::pixels::{FitRules, PixelModel, fit_pixels, noise_dn};
 use super::{Finding, NoFinding, distinct, positive};
 use crate::fiducial::normal_at;
 use crate::image::Image8;
@@ -48,10 +48,10 @@ pub struct DiscRules {
     pub min_contrast_dn: f64,
     /// Least correlation of model and image.
     pub min_score: f64,
-    /// Largest rms difference between model and image, as a fraction of the contrast; `noise_dn` is
-    /// granted on top.
+    /// Largest rms difference between model and image beyond the image's own noise, as a fraction of
+    /// the contrast.
     pub max_residual_fraction: f64,
-    /// Largest grey noise that the residual check puts up with, DN.
+    /// Largest grey noise of the image that the residual check puts up with, DN.
     pub noise_dn: f64,
     /// Largest blur of the edge, px.
     pub max_blur_px: f64,
@@ -69,13 +69,13 @@ impl Default for DiscRules {
     fn default() -> Self {
         Self {
             polarity: Polarity::Dark,
-            min_radius_px: 2.5,
+            min_radius_px: 3.5,
             max_radius_px: 80.0,
             min_axis_ratio: 0.3,
             max_fill_error: 0.06,
             min_contrast_dn: 30.0,
             min_score: 0.965,
-            max_residual_fraction: 0.05,
+            max_residual_fraction: 0.02,
             noise_dn: 6.0,
             max_blur_px: 1.6,
             margin_px: 2.5,
@@ -199,6 +199,36 @@ impl PixelModel<6> for Ellipse {
         (f64::from(inside), weight)
     }
 
+    /// Outline moved outwards by cos k t and sin k t px for k = 3 to 6 (1 is the centre, 2 the
+    /// ellipse), blur changed by cos k t and sin k t for k = 1 and 2.
+    const DEFORMATIONS: usize = 12;
+    const GRANTED_PX: f64 = 0.02;
+
+    fn deform(&self, p: &[f64; 6], u: f64, v: f64, out: &mut [f64]) {
+        let [a, b, c] = self.matrix(p);
+        let (du, dv) = (u - p[0], v - p[1]);
+        let (x, y) = (a * du + b * dv, b * du + c * dv);
+        let radius = (x * x + y * y).sqrt();
+        if radius < 1e-3 {
+            return;
+        }
+        let (nx, ny) = (x / radius, y / radius);
+        let (gu, gv) = (a * nx + b * ny, b * nx + c * ny);
+        let z = (radius - 1.0) / (gu * gu + gv * gv).sqrt() / p[5];
+        let rate = f64::from(normal_at(-z as f32).1) / p[5];
+        let (mut cos, mut sin) = (1.0, 0.0);
+        for k in 1..=6 {
+            (cos, sin) = (cos * nx - sin * ny, sin * nx + cos * ny);
+            let (at, factor) = if k < 3 {
+                (6 + 2 * k, rate * z)
+            } else {
+                (2 * (k - 3), rate)
+            };
+            out[at] = factor * cos;
+            out[at + 1] = factor * sin;
+        }
+    }
+
     fn reach(&self, p: &[f64; 6]) -> f64 {
         self.semi_axes(p).1 + self.margin_px + 0.5
     }
@@ -267,6 +297,7 @@ fn fit(
     image: &Image8,
     blob: &Blob,
     dark: bool,
+    noise_dn: f64,
     rules: &DiscRules,
     truth: Option<&DiscTruth>,
 ) -> Result<Finding, NoFinding> {
@@ -278,12 +309,6 @@ fn fit(
     let found = fit_pixels(image, &model, start, 2.0)?;
     let p = &found.parameters;
     let contrast_dn = if dark { -found.gain_dn } else { found.gain_dn };
-    if contrast_dn < rules.min_contrast_dn {
-        return Err(NoFinding::LowContrast {
-            found_dn: contrast_dn,
-            needed_dn: rules.min_contrast_dn,
-        });
-    }
     let (short, long) = model.semi_axes(p);
     if short < rules.min_radius_px {
         return Err(NoFinding::TooSmall {
@@ -298,41 +323,22 @@ fn fit(
             expected: format!("at least {}", rules.min_axis_ratio),
         });
     }
-    let blur_limit = rules.max_blur_px.min(0.5 * short);
-    if p[5] > blur_limit {
-        return Err(NoFinding::Shape {
-            what: "blur of the edge in px",
-            found: p[5],
-            expected: format!("at most {blur_limit:.2}"),
-        });
-    }
-    if found.score < rules.min_score {
-        return Err(NoFinding::LowScore {
-            score: found.score,
-            limit: rules.min_score,
-        });
-    }
-    let limit_dn = rules.max_residual_fraction * contrast_dn + rules.noise_dn;
-    if found.rms_dn > limit_dn {
-        return Err(NoFinding::Misfit {
-            rms_dn: found.rms_dn,
-            limit_dn,
-        });
-    }
-    if found.saturated > rules.max_saturated_fraction {
-        return Err(NoFinding::Saturated {
-            fraction: found.saturated,
-            limit: rules.max_saturated_fraction,
-        });
-    }
-    let floor = rules.sigma_floor_px;
-    let sigma_px = (found.sigma_px * found.sigma_px + floor * floor).sqrt();
-    if sigma_px > rules.max_sigma_px {
-        return Err(NoFinding::Uncertain {
-            sigma_px,
-            limit_px: rules.max_sigma_px,
-        });
-    }
+    let sigma_px = found.check(
+        image,
+        &model,
+        contrast_dn,
+        noise_dn,
+        &FitRules {
+            min_contrast_dn: rules.min_contrast_dn,
+            max_blur_px: rules.max_blur_px.min(0.5 * short),
+            min_score: rules.min_score,
+            max_residual_fraction: rules.max_residual_fraction,
+            noise_dn: rules.noise_dn,
+            max_saturated_fraction: rules.max_saturated_fraction,
+            max_sigma_px: rules.max_sigma_px,
+            sigma_floor_px: rules.sigma_floor_px,
+        },
+    )?;
     let mut centre = [p[0], p[1]];
     if let Some(truth) = truth {
         let at = true_centre(centre, model.matrix(p), truth)?;
@@ -456,6 +462,7 @@ pub fn disc(
         Polarity::Light => &[false],
         Polarity::Either => &[true, false],
     };
+    let noise = noise_dn(image, window);
     let mut found: Vec<Finding> = Vec::new();
     let mut refusal: Option<(f64, NoFinding)> = None;
     for &dark in kinds {
@@ -468,7 +475,7 @@ pub fn disc(
             if blob.at_border {
                 continue;
             }
-            match fit(image, &blob, dark, rules, truth) {
+            match fit(image, &blob, dark, noise, rules, truth) {
                 Ok(one) => found.push(one),
                 Err(e) => {
                     if refusal.as_ref().is_none_or(|(area, _)| blob.area > *area) {

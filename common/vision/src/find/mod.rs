@@ -308,8 +308,10 @@ pub fn harris(
     Ok(found)
 }
 
-/// Standard deviation stated for Harris corners, px: the scatter of a corner against the surface
-/// it belongs to, measured over rendered views (`rover vision evaluate`).
+/// Standard deviation stated for Harris corners, px: that of a corner's place between two exposures
+/// of one textured surface with grey noise of 3 DN. `rover vision evaluate --only harris` measures
+/// 0.08 px at 1 DN and 0.26 px at 5 DN. How far a corner lies from the surface mark that a person
+/// would call the corner is another matter: the response pulls it inwards.
 pub const HARRIS_SIGMA_PX: f64 = 0.2;
 
 /// A part of an image as an image.

@@ -1,18 +1,31 @@
 //! Least squares of a shape's blurred image on grey values.
 //!
-//! Model: pixel = offset + gain * value(pixel; p). Gain and offset are solved for together with the
-//! linearised change of p (Gauss-Newton with the linear parameters projected out). The first two
-//! parameters are the centre.
+//! Model: pixel = (offset + gain * value(pixel; p)) * (1 + slope of light . offset from the middle).
+//! Gain, offset and the slope are solved for together with the linearised change of p (Gauss-Newton
+//! with the linear parameters projected out). The first two parameters are the centre.
+//!
+//! Whether it is the shape at all is asked of the residual in two ways, both against the noise that
+//! the image itself shows: how much more of it there is, and how far the shape would have to be
+//! deformed (curved edges, bulges, uneven blur ...) to explain it.
 
 use nalgebra::{DMatrix, DVector};
 
 use super::NoFinding;
 use crate::image::Image8;
+use crate::ncc::Window;
 
 /// A shape with `N` parameters.
 pub(super) trait PixelModel<const N: usize> {
     /// Value (any unit), its derivatives by the parameters, and the pixel's weight (0 to 1).
     fn at(&self, p: &[f64; N], u: f64, v: f64, slopes: &mut [f64; N]) -> (f64, f64);
+
+    /// Number of deformations of the shape that are tested.
+    const DEFORMATIONS: usize;
+    /// Deformation that is granted (print, lens, sensor, the model's own approximations), px.
+    const GRANTED_PX: f64;
+
+    /// What deformations by one pixel each would add to the value at a pixel; `out` is zero.
+    fn deform(&self, p: &[f64; N], u: f64, v: f64, out: &mut [f64]);
 
     /// How far the window reaches from the centre in u and v, px.
     fn reach(&self, p: &[f64; N]) -> f64;
@@ -30,15 +43,194 @@ pub(super) struct PixelFit<const N: usize> {
     /// Correlation of model and image, 0 to 1.
     pub score: f64,
     pub rms_dn: f64,
+    /// Weighted pixels less parameters.
+    freedom: f64,
+    light: Brightness,
     /// Standard deviation of the centre in each direction (root mean square of both), px.
     pub sigma_px: f64,
     /// Fraction of the window's pixels that are clipped.
     pub saturated: f64,
 }
 
+/// What every fitted shape must satisfy.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct FitRules {
+    pub min_contrast_dn: f64,
+    pub max_blur_px: f64,
+    pub min_score: f64,
+    pub max_residual_fraction: f64,
+    pub noise_dn: f64,
+    pub max_saturated_fraction: f64,
+    pub max_sigma_px: f64,
+    pub sigma_floor_px: f64,
+}
+
+/// A shape passes with deformations up to this multiple of what noise and the granted deformation
+/// explain: with a dozen deformations the shape itself exceeds it once in some ten thousand.
+const MAX_DEFORMATION: f64 = 1.8;
+
+impl<const N: usize> PixelFit<N> {
+    /// The standard deviation to state, px, if contrast, blur (the last parameter), score, residual,
+    /// deformation, clipping and certainty are acceptable; `noise_dn` is the image's own.
+    pub fn check<M: PixelModel<N>>(
+        &self,
+        image: &Image8,
+        model: &M,
+        contrast_dn: f64,
+        noise_dn: f64,
+        rules: &FitRules,
+    ) -> Result<f64, NoFinding> {
+        if !(contrast_dn >= rules.min_contrast_dn) {
+            return Err(NoFinding::LowContrast {
+                found_dn: contrast_dn,
+                needed_dn: rules.min_contrast_dn,
+            });
+        }
+        let blur_px = self.parameters[N - 1];
+        if !(blur_px <= rules.max_blur_px) {
+            return Err(NoFinding::Shape {
+                what: "blur of the edge in px",
+                found: blur_px,
+                expected: format!("at most {:.2}", rules.max_blur_px),
+            });
+        }
+        if !(self.score >= rules.min_score) {
+            return Err(NoFinding::LowScore {
+                score: self.score,
+                limit: rules.min_score,
+            });
+        }
+        let noise_dn = noise_dn.min(rules.noise_dn).max(QUANTISATION_DN);
+        // the variance of a mean of n squares of noise is 2 / n
+        let chance = 1.0 + RESIDUAL_SIGMAS * (2.0 / self.freedom).sqrt();
+        let misfit_dn = rules.max_residual_fraction * contrast_dn;
+        let limit_dn = (noise_dn * noise_dn * chance + misfit_dn * misfit_dn).sqrt();
+        if !(self.rms_dn <= limit_dn) {
+            return Err(NoFinding::Misfit {
+                rms_dn: self.rms_dn,
+                limit_dn,
+            });
+        }
+        if !(self.saturated <= rules.max_saturated_fraction) {
+            return Err(NoFinding::Saturated {
+                fraction: self.saturated,
+                limit: rules.max_saturated_fraction,
+            });
+        }
+        let floor = rules.sigma_floor_px;
+        let sigma_px = (self.sigma_px * self.sigma_px + floor * floor).sqrt();
+        if !(sigma_px <= rules.max_sigma_px) {
+            return Err(NoFinding::Uncertain {
+                sigma_px,
+                limit_px: rules.max_sigma_px,
+            });
+        }
+        let deformation = self.deformation(image, model, noise_dn)?;
+        if !(deformation <= MAX_DEFORMATION) {
+            return Err(NoFinding::Shape {
+                what: "deformation over what noise explains",
+                found: deformation,
+                expected: format!("at most {MAX_DEFORMATION}"),
+            });
+        }
+        Ok(sigma_px)
+    }
+
+    /// Deformations of the shape that would explain the residual, root mean square, over what noise
+    /// and the granted deformation explain: 1 or less for the shape itself.
+    fn deformation<M: PixelModel<N>>(
+        &self,
+        image: &Image8,
+        model: &M,
+        noise_dn: f64,
+    ) -> Result<f64, NoFinding> {
+        let extra = M::DEFORMATIONS;
+        let size = N + extra + LINEAR;
+        let sums = accumulate(image, model, &self.parameters, self.light, extra)?;
+        let singular = || NoFinding::NothingThere("a window too small to tell shapes apart".into());
+        let mut normal = sums.matrix.view((0, 0), (size, size)).into_owned();
+        hold(&mut normal, size - LINEAR);
+        let right = DVector::from_fn(size, |i, _| sums.matrix[(i, size)]);
+        let factor = normal.cholesky().ok_or_else(singular)?;
+        let x = factor.solve(&right);
+        let scale = 1.0 / self.gain_dn;
+        let noise = noise_dn * scale;
+        let covariance = factor.inverse().view((N, N), (extra, extra)) * (noise * noise);
+        let granted = DMatrix::identity(extra, extra) * (M::GRANTED_PX * M::GRANTED_PX);
+        let against = (covariance + granted).cholesky().ok_or_else(singular)?;
+        let amplitudes = x.rows(N, extra) * scale;
+        let ratio = amplitudes.dot(&against.solve(&amplitudes)) / extra as f64;
+        Ok(ratio.max(0.0).sqrt())
+    }
+}
+
+/// Residuals pass that noise alone exceeds by chance this many standard deviations away.
+const RESIDUAL_SIGMAS: f64 = 4.0;
+
+/// Largest sample of second differences that the noise is read from.
+const NOISE_SAMPLE: usize = 20_000;
+/// Surroundings of a window that help to read the noise, px.
+const NOISE_MARGIN_PX: u32 = 16;
+
+/// Standard deviation of the grey noise in and around a window, DN: the median size of the second
+/// difference in u of the second difference in v, which smooth shading and straight edges along
+/// the pixels do not change (mask of J. Immerkaer, "Fast noise variance estimation", 1996). Clipped
+/// pixels are left out.
+pub(super) fn noise_dn(image: &Image8, window: Window) -> f64 {
+    let m = NOISE_MARGIN_PX;
+    let wide = Window {
+        left: window.left.saturating_sub(m),
+        top: window.top.saturating_sub(m),
+        width: window.width.saturating_add(2 * m),
+        height: window.height.saturating_add(2 * m),
+    }
+    .clipped(image);
+    let (w, h) = (wide.width as usize, wide.height as usize);
+    if w < 3 || h < 3 {
+        return QUANTISATION_DN;
+    }
+    let row = |y: usize| {
+        let start = (wide.top as usize + y) * image.width_px as usize + wide.left as usize;
+        &image.pixels[start..start + w]
+    };
+    let every = ((w - 2) * (h - 2)).div_ceil(NOISE_SAMPLE);
+    let mut counts = vec![0usize; 2049];
+    let mut total = 0;
+    for y in (1..h - 1).step_by(every) {
+        let lines = [row(y - 1), row(y), row(y + 1)];
+        for x in 1..w - 1 {
+            let clipped = |p: u8| p == 0 || p >= SATURATION_DN;
+            if lines
+                .iter()
+                .any(|l| l[x - 1..x + 2].iter().any(|&p| clipped(p)))
+            {
+                continue;
+            }
+            let second = |l: &[u8]| i32::from(l[x - 1]) - 2 * i32::from(l[x]) + i32::from(l[x + 1]);
+            let mixed = second(lines[0]) - 2 * second(lines[1]) + second(lines[2]);
+            counts[(mixed.unsigned_abs() as usize).min(2048)] += 1;
+            total += 1;
+        }
+    }
+    // the median of |x| of a normal x is 0.6745 sigma; the mask's weights have norm 6
+    let mut below = 0;
+    for (size, count) in counts.into_iter().enumerate() {
+        if 2 * (below + count) >= total && count > 0 {
+            let part = (0.5 * total as f64 - below as f64) / count as f64;
+            let median = (size as f64 - 0.5 + part).max(0.0);
+            return (median / (0.6745 * 6.0)).max(QUANTISATION_DN);
+        }
+        below += count;
+    }
+    QUANTISATION_DN
+}
+
 const MAX_STEPS: usize = 25;
 /// A fit has settled when its step moves the centre by less, px.
 const SETTLED_PX: f64 = 0.002;
+/// After so many steps a fit that explains less than half of the grey values' variance is given up.
+const PATIENCE: usize = 5;
+const HOPELESS_SCORE: f64 = std::f64::consts::FRAC_1_SQRT_2;
 /// Grey values from here on count as clipped, DN.
 const SATURATION_DN: u8 = 254;
 /// Quantisation alone has this standard deviation, DN.
@@ -46,18 +238,30 @@ const QUANTISATION_DN: f64 = 0.29;
 /// Least weight of a window, px.
 const MIN_WEIGHT_PX: f64 = 16.0;
 
-/// Normal equations over the window: `N` slopes, value, one, and the grey value last.
+/// Linear parameters beside the shape's: slope of light in u and v, value, one.
+const LINEAR: usize = 4;
+
+/// Brightness by which light multiplies: the model's image in units of its own mean size.
+#[derive(Clone, Copy, Debug)]
+struct Brightness {
+    offset: f64,
+    gain: f64,
+}
+
+/// Normal equations over the window: `N` slopes, deformations if asked for, the slope of light in u
+/// and v, value, one, and the grey value last.
 struct Sums {
     matrix: DMatrix<f64>,
     saturated: f64,
     counted: f64,
 }
 
-fn accumulate<const N: usize>(
+/// Pixels of the window around the centre, if it lies inside the image.
+fn window_of<const N: usize>(
     image: &Image8,
     model: &impl PixelModel<N>,
     p: &[f64; N],
-) -> Result<Sums, NoFinding> {
+) -> Result<[std::ops::RangeInclusive<usize>; 2], NoFinding> {
     let reach = model.reach(p);
     let fits = |x: f64, size: u32| x - reach >= 0.0 && x + reach <= f64::from(size) - 1.0;
     if !(fits(p[0], image.width_px) && fits(p[1], image.height_px)) {
@@ -67,36 +271,74 @@ fn accumulate<const N: usize>(
         });
     }
     let range = |x: f64| (x - reach).ceil() as usize..=(x + reach).floor() as usize;
-    let mut matrix = DMatrix::zeros(N + 3, N + 3);
-    let mut column = vec![0.0; N + 3];
+    Ok([range(p[0]), range(p[1])])
+}
+
+/// One pixel's column of the design matrix without the grey value; its weight.
+fn design<const N: usize>(
+    model: &impl PixelModel<N>,
+    p: &[f64; N],
+    light: Brightness,
+    deformations: usize,
+    (u, v): (usize, usize),
+    column: &mut [f64],
+) -> f64 {
+    let (u, v) = (u as f64, v as f64);
+    let mut slopes = [0.0; N];
+    let (value, weight) = model.at(p, u, v, &mut slopes);
+    if !(weight > 0.0) {
+        return 0.0;
+    }
+    column[..N].copy_from_slice(&slopes);
+    let k = N + deformations;
+    if deformations > 0 {
+        column[N..k].fill(0.0);
+        model.deform(p, u, v, &mut column[N..k]);
+    }
+    let brightness = light.offset + light.gain * value;
+    column[k] = (u - p[0]) * brightness;
+    column[k + 1] = (v - p[1]) * brightness;
+    column[k + 2] = value;
+    column[k + 3] = 1.0;
+    weight
+}
+
+fn accumulate<const N: usize>(
+    image: &Image8,
+    model: &impl PixelModel<N>,
+    p: &[f64; N],
+    light: Brightness,
+    deformations: usize,
+) -> Result<Sums, NoFinding> {
+    let [columns, rows] = window_of(image, model, p)?;
+    let size = N + deformations + LINEAR;
+    let mut sums = vec![0.0; (size + 1) * (size + 1)];
+    let mut column = vec![0.0; size + 1];
     let (mut saturated, mut counted) = (0.0, 0.0);
-    for v in range(p[1]) {
+    for v in rows {
         let row = &image.pixels[v * image.width_px as usize..][..image.width_px as usize];
-        for u in range(p[0]) {
-            let mut slopes = [0.0; N];
-            let (value, weight) = model.at(p, u as f64, v as f64, &mut slopes);
-            if !(weight > 0.0) {
+        for u in columns.clone() {
+            let weight = design(model, p, light, deformations, (u, v), &mut column[..size]);
+            if weight == 0.0 {
                 continue;
             }
             counted += 1.0;
             saturated += f64::from(u8::from(row[u] >= SATURATION_DN));
-            column[..N].copy_from_slice(&slopes);
-            column[N] = value;
-            column[N + 1] = 1.0;
-            column[N + 2] = f64::from(row[u]);
-            for i in 0..N + 3 {
-                let weighted = weight * column[i];
-                for j in i..N + 3 {
-                    matrix[(i, j)] += weighted * column[j];
+            column[size] = f64::from(row[u]);
+            // the lower triangle, column by column
+            let mut start = 0;
+            for (i, &x) in column.iter().enumerate() {
+                let weighted = weight * x;
+                let end = start + size + 1;
+                for (m, &y) in sums[start + i..end].iter_mut().zip(&column[i..]) {
+                    *m += weighted * y;
                 }
+                start = end;
             }
         }
     }
-    for i in 0..N + 3 {
-        for j in 0..i {
-            matrix[(i, j)] = matrix[(j, i)];
-        }
-    }
+    let mut matrix = DMatrix::from_vec(size + 1, size + 1, sums);
+    matrix.fill_upper_triangle_with_lower_triangle();
     Ok(Sums {
         matrix,
         saturated: saturated / f64::max(counted, 1.0),
@@ -104,10 +346,18 @@ fn accumulate<const N: usize>(
     })
 }
 
+/// Adds the least that keeps a parameter without influence from making the equations singular.
+fn hold(normal: &mut DMatrix<f64>, parameters: usize) {
+    for i in 0..parameters {
+        normal[(i, i)] *= 1.0 + 1e-6;
+        normal[(i, i)] += 1e-9;
+    }
+}
+
 /// Fits the shape from a start; the centre may move by `max_move_px` at most.
-pub(super) fn fit_pixels<const N: usize>(
+pub(super) fn fit_pixels<const N: usize, M: PixelModel<N>>(
     image: &Image8,
-    model: &impl PixelModel<N>,
+    model: &M,
     start: [f64; N],
     max_move_px: f64,
 ) -> Result<PixelFit<N>, NoFinding> {
@@ -120,10 +370,14 @@ pub(super) fn fit_pixels<const N: usize>(
         moved_px: moved(p),
         limit_px: max_move_px,
     };
-    for _ in 0..MAX_STEPS {
-        let sums = accumulate(image, model, &p)?;
-        let size = N + 2;
-        let weight = sums.matrix[(N + 1, N + 1)];
+    let mut light = Brightness {
+        offset: 1.0,
+        gain: 0.0,
+    };
+    let size = N + LINEAR;
+    for round in 0..MAX_STEPS {
+        let sums = accumulate(image, model, &p, light, 0)?;
+        let weight = sums.matrix[(size - 1, size - 1)];
         if weight < MIN_WEIGHT_PX {
             return Err(NoFinding::TooSmall {
                 found_px: weight.sqrt(),
@@ -131,16 +385,24 @@ pub(super) fn fit_pixels<const N: usize>(
             });
         }
         let mut normal = sums.matrix.view((0, 0), (size, size)).into_owned();
-        for i in 0..N {
-            normal[(i, i)] *= 1.0 + 1e-6;
-            normal[(i, i)] += 1e-9;
-        }
-        let right = DVector::from_fn(size, |i, _| sums.matrix[(i, N + 2)]);
+        hold(&mut normal, N + 2);
+        let right = DVector::from_fn(size, |i, _| sums.matrix[(i, size)]);
         let factor = normal.cholesky().ok_or_else(|| diverged(&p))?;
         let x = factor.solve(&right);
-        let gain = x[N];
+        let (gain, offset) = (x[size - 2], x[size - 1]);
         if !x.iter().all(|x| x.is_finite()) || gain == 0.0 {
             return Err(diverged(&p));
+        }
+        let grey = sums.matrix[(size, size)];
+        let sum = sums.matrix[(size - 1, size)];
+        let residual = (grey - x.dot(&right)).max(0.0);
+        let total = grey - sum * sum / weight;
+        let score = (1.0 - residual / total.max(1e-9)).max(0.0).sqrt();
+        if round >= PATIENCE && score < HOPELESS_SCORE {
+            return Err(NoFinding::LowScore {
+                score,
+                limit: HOPELESS_SCORE,
+            });
         }
         let mut step = [0.0; N];
         for (s, x) in step.iter_mut().zip(x.iter()) {
@@ -154,10 +416,6 @@ pub(super) fn fit_pixels<const N: usize>(
         let (du, dv) = (p[0] - before[0], p[1] - before[1]);
         let rest = (2..N).fold(0.0f64, |m, i| m.max((p[i] - before[i]).abs()));
         if (du * du + dv * dv).sqrt() < SETTLED_PX && rest < 0.01 {
-            let grey = sums.matrix[(N + 2, N + 2)];
-            let sum = sums.matrix[(N + 1, N + 2)];
-            let residual = (grey - x.dot(&right)).max(0.0);
-            let total = grey - sum * sum / weight;
             let freedom = (weight - size as f64).max(1.0);
             let rms_dn = (residual / freedom).sqrt();
             let inverse = factor.inverse();
@@ -165,8 +423,10 @@ pub(super) fn fit_pixels<const N: usize>(
             return Ok(PixelFit {
                 parameters: p,
                 gain_dn: gain,
-                score: (1.0 - residual / total.max(1e-9)).max(0.0).sqrt(),
+                score,
                 rms_dn,
+                freedom,
+                light,
                 sigma_px: rms_dn.max(QUANTISATION_DN) * variance.max(0.0).sqrt() / gain.abs(),
                 saturated: if sums.counted > 0.0 {
                     sums.saturated
@@ -175,6 +435,11 @@ pub(super) fn fit_pixels<const N: usize>(
                 },
             });
         }
+        let size_dn = offset.abs() + gain.abs();
+        light = Brightness {
+            offset: offset / size_dn,
+            gain: gain / size_dn,
+        };
     }
     Err(diverged(&p))
 }

@@ -8,7 +8,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::pixels::{PixelModel, fit_pixels};
+use super::pixels::{FitRules, PixelModel, fit_pixels, noise_dn};
 use super::{Finding, NoFinding, cut, positive};
 use crate::fiducial::normal_at;
 use crate::image::{Image8, ImageF};
@@ -26,10 +26,10 @@ pub struct SaddleRules {
     pub min_contrast_dn: f64,
     /// Least correlation of model and image.
     pub min_score: f64,
-    /// Largest rms difference between model and image, as a fraction of the contrast; `noise_dn` is
-    /// granted on top.
+    /// Largest rms difference between model and image beyond the image's own noise, as a fraction of
+    /// the contrast.
     pub max_residual_fraction: f64,
-    /// Largest grey noise that the residual check puts up with, DN.
+    /// Largest grey noise of the image that the residual check puts up with, DN.
     pub noise_dn: f64,
     /// Least sine of the angle between the edges.
     pub min_sine: f64,
@@ -52,10 +52,10 @@ impl Default for SaddleRules {
             smoothing_px: 1.5,
             min_contrast_dn: 20.0,
             min_score: 0.93,
-            max_residual_fraction: 0.06,
+            max_residual_fraction: 0.02,
             noise_dn: 6.0,
             min_sine: 0.35,
-            max_blur_px: 2.5,
+            max_blur_px: 1.6,
             max_sigma_px: 0.2,
             max_saturated_fraction: 0.6,
             max_candidates: 64,
@@ -132,6 +132,40 @@ impl PixelModel<5> for Crossing {
             da[3] * b + a * db[3],
         ];
         (a * b, weight)
+    }
+
+    /// Each edge bent (t^2), kinked (|t|) and bent to an S (t^3), its blur different from the other's
+    /// and changing along it, t from -1 to 1 over the window; quadrants of unequal grey (in units of
+    /// the contrast); a gap or a neck at the crossing.
+    const DEFORMATIONS: usize = 12;
+    const GRANTED_PX: f64 = 0.12;
+
+    fn deform(&self, p: &[f64; 5], u: f64, v: f64, out: &mut [f64]) {
+        let (du, dv) = (u - p[0], v - p[1]);
+        let edge = |which: usize| {
+            let n = self.turned(which, p[2 + which]);
+            let z = (n[0] * du + n[1] * dv) / p[4];
+            let (below, density) = normal_at(z as f32);
+            let rate = 2.0 * f64::from(density) / p[4];
+            let along = (-n[1] * du + n[0] * dv) / self.window_px;
+            (2.0 * f64::from(below) - 1.0, rate, rate * z, along)
+        };
+        let (a, rate_a, blur_a, s) = edge(0);
+        let (b, rate_b, blur_b, t) = edge(1);
+        out.copy_from_slice(&[
+            rate_a * b * s * s,
+            rate_a * b * s.abs(),
+            rate_a * b * s * s * s,
+            rate_b * a * t * t,
+            rate_b * a * t.abs(),
+            rate_b * a * t * t * t,
+            blur_a * b - blur_b * a,
+            blur_a * b * s,
+            blur_b * a * t,
+            a,
+            b,
+            rate_a * rate_b * p[4],
+        ]);
     }
 
     fn reach(&self, _: &[f64; 5]) -> f64 {
@@ -262,7 +296,12 @@ fn edge_normals([uu, uv, vv]: [f64; 3]) -> Option<[[f64; 2]; 2]> {
     Some([normal(1.0), normal(-1.0)])
 }
 
-fn fit(image: &Image8, candidate: &Candidate, rules: &SaddleRules) -> Result<Finding, NoFinding> {
+fn fit(
+    image: &Image8,
+    candidate: &Candidate,
+    noise_dn: f64,
+    rules: &SaddleRules,
+) -> Result<Finding, NoFinding> {
     let skew = |found| NoFinding::Shape {
         what: "sine of the angle between the edges",
         found,
@@ -280,49 +319,25 @@ fn fit(image: &Image8, candidate: &Candidate, rules: &SaddleRules) -> Result<Fin
     let (a, b) = (model.turned(0, p[2]), model.turned(1, p[3]));
     let sine = (a[0] * b[1] - a[1] * b[0]).abs();
     let contrast_dn = 2.0 * found.gain_dn.abs();
-    if contrast_dn < rules.min_contrast_dn {
-        return Err(NoFinding::LowContrast {
-            found_dn: contrast_dn,
-            needed_dn: rules.min_contrast_dn,
-        });
-    }
     if sine < rules.min_sine {
         return Err(skew(sine));
     }
-    if p[4] > rules.max_blur_px {
-        return Err(NoFinding::Shape {
-            what: "blur in px",
-            found: p[4],
-            expected: format!("at most {}", rules.max_blur_px),
-        });
-    }
-    if found.score < rules.min_score {
-        return Err(NoFinding::LowScore {
-            score: found.score,
-            limit: rules.min_score,
-        });
-    }
-    let limit_dn = rules.max_residual_fraction * contrast_dn + rules.noise_dn;
-    if found.rms_dn > limit_dn {
-        return Err(NoFinding::Misfit {
-            rms_dn: found.rms_dn,
-            limit_dn,
-        });
-    }
-    if found.saturated > rules.max_saturated_fraction {
-        return Err(NoFinding::Saturated {
-            fraction: found.saturated,
-            limit: rules.max_saturated_fraction,
-        });
-    }
-    let sigma_px =
-        (found.sigma_px * found.sigma_px + rules.sigma_floor_px * rules.sigma_floor_px).sqrt();
-    if sigma_px > rules.max_sigma_px {
-        return Err(NoFinding::Uncertain {
-            sigma_px,
-            limit_px: rules.max_sigma_px,
-        });
-    }
+    let sigma_px = found.check(
+        image,
+        &model,
+        contrast_dn,
+        noise_dn,
+        &FitRules {
+            min_contrast_dn: rules.min_contrast_dn,
+            max_blur_px: rules.max_blur_px,
+            min_score: rules.min_score,
+            max_residual_fraction: rules.max_residual_fraction,
+            noise_dn: rules.noise_dn,
+            max_saturated_fraction: rules.max_saturated_fraction,
+            max_sigma_px: rules.max_sigma_px,
+            sigma_floor_px: rules.sigma_floor_px,
+        },
+    )?;
     Ok(Finding::at(p[0], p[1], found.score, sigma_px))
 }
 
@@ -342,8 +357,9 @@ pub fn saddle(
     rules.validate()?;
     let mut found: Vec<Finding> = Vec::new();
     let mut refusal = None;
+    let noise = noise_dn(image, window);
     for candidate in candidates(image, window, rules)? {
-        match fit(image, &candidate, rules) {
+        match fit(image, &candidate, noise, rules) {
             Ok(one) => found.push(one),
             Err(e) => {
                 refusal.get_or_insert(e);

@@ -4,6 +4,7 @@
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 use serde::{Deserialize, Serialize};
 
+use super::pixels::noise_dn;
 use super::warp::{Appearance, Patch, warp};
 use super::{Finding, NoFinding, cut, near, positive};
 use crate::image::{Image8, ImageF};
@@ -16,6 +17,9 @@ use crate::sample::SplineImage;
 pub struct TemplateRules {
     /// Least NCC, in the search and after refinement.
     pub min_score: f64,
+    /// Least NCC after refinement, freed of what the grey noise of image and picture takes off it:
+    /// how alike the surfaces are, however noisy they are seen.
+    pub min_similarity: f64,
     /// Largest NCC of any other place, as a fraction of the best one's.
     pub uniqueness_ratio: f64,
     /// Resolutions of the search; 1 correlates at full resolution only.
@@ -36,6 +40,7 @@ impl Default for TemplateRules {
     fn default() -> Self {
         Self {
             min_score: 0.7,
+            min_similarity: 0.9,
             uniqueness_ratio: 0.9,
             levels: 3,
             affine: true,
@@ -51,6 +56,7 @@ impl TemplateRules {
     fn validate(&self) -> Result<(), NoFinding> {
         for (name, x) in [
             ("min_score", self.min_score),
+            ("min_similarity", self.min_similarity),
             ("uniqueness_ratio", self.uniqueness_ratio),
             ("levels", self.levels as f64),
             ("max_correction_px", self.max_correction_px),
@@ -82,7 +88,9 @@ pub fn template(
         mask: None,
         offset: Vector2::zeros(),
     };
-    find(image, &patch, window, rules)
+    let whole = Window::whole(picture);
+    let noises = [noise_dn(image, window), noise_dn(picture, whole)];
+    find(image, &patch, window, noises, rules)
 }
 
 /// Finds a flat picture within `radius_px` of where its predicted appearance puts it, comparing the
@@ -110,7 +118,9 @@ pub fn warped_template(
         top: high.top,
         height: high.height,
     };
-    find(image, &patch, window, rules)
+    let whole = Window::whole(picture);
+    let noises = [noise_dn(image, window), noise_dn(picture, whole)];
+    find(image, &patch, window, noises, rules)
 }
 
 /// Peaks closer than this are one place, px.
@@ -120,6 +130,7 @@ fn find(
     image: &Image8,
     patch: &Patch,
     window: Window,
+    noises_dn: [f64; 2],
     rules: &TemplateRules,
 ) -> Result<Finding, NoFinding> {
     image.validate()?;
@@ -157,7 +168,7 @@ fn find(
             limit: rules.uniqueness_ratio,
         });
     }
-    let found = refine(image, patch, best, rules)?;
+    let found = refine(image, patch, best, noises_dn, rules)?;
     if found.score < rules.min_score {
         return Err(low(found.score));
     }
@@ -176,12 +187,13 @@ const SETTLED_PX: f64 = 0.002;
 /// Room around the patch that the fit may use, px.
 const ROOM_PX: u32 = 12;
 
-/// Affine least-squares matching from a peak. Derivatives are the template's, so that their noise
+/// Affine least-squares matching from a peak, with gain, offset and a ramp of light. Derivatives are the template's, so that their noise
 /// is independent of the image's.
 fn refine(
     image: &Image8,
     patch: &Patch,
     peak: &Peak,
+    noises_dn: [f64; 2],
     rules: &TemplateRules,
 ) -> Result<Finding, NoFinding> {
     let (w, h) = (patch.width, patch.height);
@@ -209,9 +221,10 @@ fn refine(
     let corner = Vector2::new(f64::from(left), f64::from(top));
     let scale = 1.0 / half_u.max(half_v).max(1.0);
 
-    // slopes by u, v and the four affine elements, then value and one, where the patch has them
+    // slopes by u, v and the four affine elements, then value, one and a ramp of light (x, y),
+    // where the patch has them
     let on = |i: usize, j: usize| patch.mask.as_ref().is_none_or(|m| m[j * w + i]);
-    let mut rows: Vec<(usize, SVector<f64, 8>)> = Vec::with_capacity(w * h);
+    let mut rows: Vec<(usize, SVector<f64, 10>)> = Vec::with_capacity(w * h);
     for j in 1..h.saturating_sub(1) {
         for i in 1..w.saturating_sub(1) {
             if !(on(i, j) && on(i - 1, j) && on(i + 1, j) && on(i, j - 1) && on(i, j + 1)) {
@@ -221,11 +234,11 @@ fn refine(
             let gu = 0.5 * (at(i + 1, j) - at(i - 1, j));
             let gv = 0.5 * (at(i, j + 1) - at(i, j - 1));
             let (x, y) = ((i as f64 - half_u) * scale, (j as f64 - half_v) * scale);
-            let row = [gu, gv, gu * x, gu * y, gv * x, gv * y, at(i, j), 1.0];
+            let row = [gu, gv, gu * x, gu * y, gv * x, gv * y, at(i, j), 1.0, x, y];
             rows.push((j * w + i, SVector::from(row)));
         }
     }
-    let mut normal = SMatrix::<f64, 8, 8>::zeros();
+    let mut normal = SMatrix::<f64, 10, 10>::zeros();
     for (_, row) in &rows {
         normal.ger(1.0, row, row, 1.0);
     }
@@ -269,7 +282,7 @@ fn refine(
         if !inside {
             return border_peak(patch, peak, patch_variance, &rows, rules).ok_or_else(outside);
         }
-        let mut right_side = SVector::<f64, 8>::zeros();
+        let mut right_side = SVector::<f64, 10>::zeros();
         let (mut sum, mut squares) = (0.0, 0.0);
         for (k, row) in &rows {
             let y = f64::from(samples[*k]);
@@ -315,7 +328,18 @@ fn refine(
             let cross = right_side[6] - mean * sum;
             let variance = squares - sum * sum / n;
             let score = cross / (patch_variance * variance).max(1e-12).sqrt();
-            let residual = (squares - x.dot(&right_side)).max(0.0) / (n - 8.0).max(1.0);
+            let [image_part, patch_part] = [
+                signal_part(variance / n, noises_dn[0]),
+                signal_part(patch_variance / n, noises_dn[1]),
+            ];
+            let similarity = score / (image_part * patch_part).sqrt();
+            if !(similarity >= rules.min_similarity) {
+                return Err(NoFinding::LowScore {
+                    score: similarity,
+                    limit: rules.min_similarity,
+                });
+            }
+            let residual = (squares - x.dot(&right_side)).max(0.0) / (n - 10.0).max(1.0);
             let inverse = factor.inverse();
             let spread = 0.5 * (inverse[(0, 0)] + inverse[(1, 1)]);
             // the template carries noise of its own: both images count
@@ -336,6 +360,14 @@ fn refine(
     })
 }
 
+/// Noise is never held responsible for more than this part of a window's variance.
+const MOST_NOISE: f64 = 0.6;
+
+/// The part of a window's variance that is not noise.
+fn signal_part(variance: f64, noise_dn: f64) -> f64 {
+    1.0 - (noise_dn * noise_dn / variance.max(1e-9)).min(MOST_NOISE)
+}
+
 /// Sigma granted to a peak at the image border, which cannot be fitted, px.
 const UNFITTED_SIGMA_PX: f64 = 0.15;
 
@@ -344,14 +376,14 @@ fn border_peak(
     patch: &Patch,
     peak: &Peak,
     variance: f64,
-    rows: &[(usize, SVector<f64, 8>)],
+    rows: &[(usize, SVector<f64, 10>)],
     rules: &TemplateRules,
 ) -> Option<Finding> {
     let slopes: f64 = rows.iter().map(|(_, r)| r[0] * r[0] + r[1] * r[1]).sum();
     let noise = variance * (1.0 / (peak.score * peak.score) - 1.0).max(0.0) / rows.len() as f64;
     let sigma = (noise * 2.0 / slopes.max(1e-9)).sqrt();
     let sigma = (sigma * sigma + UNFITTED_SIGMA_PX * UNFITTED_SIGMA_PX).sqrt();
-    (sigma <= rules.max_sigma_px).then(|| {
+    (sigma <= rules.max_sigma_px && peak.score >= rules.min_similarity).then(|| {
         Finding::at(
             peak.u_px + patch.offset.x,
             peak.v_px + patch.offset.y,

@@ -84,6 +84,13 @@ pub fn normal(rng: &mut ChaCha8Rng) -> f64 {
     (-2.0 * (1.0 - a).ln()).sqrt() * (std::f64::consts::TAU * b).cos()
 }
 
+/// Samples of a pixel and the generator of their lattice.
+pub type Samples = (usize, usize);
+/// For flat colours with hard edges.
+pub const EDGES: Samples = (32, 7);
+/// For smooth texture, whose finest wavelength is above a pixel.
+pub const SMOOTH: Samples = (8, 3);
+
 /// Rays of a camera's subpixels fall on a pose's plane; `shade` gives the grey value there, and
 /// where it gives none `ground` does, by pixel.
 pub fn draw(
@@ -91,8 +98,21 @@ pub fn draw(
     pose: &Isometry3<f64>,
     shade: &dyn Fn(f64, f64) -> Option<f64>,
     ground: &dyn Fn(f64, f64) -> f64,
+    samples: Samples,
 ) -> Vec<f64> {
-    const N: usize = 4;
+    // a lattice whose samples have different places in u and in v: an edge along the pixels is met
+    // as finely as any other; pixels whose rim and middle are alike need no more
+    const FEW: [(f64, f64); 5] = [
+        (0.0, 0.0),
+        (-0.5, -0.5),
+        (0.5, -0.5),
+        (-0.5, 0.5),
+        (0.5, 0.5),
+    ];
+    let lattice = |n: usize, k: usize| {
+        let part = |k: usize| (k as f64 + 0.5) / n as f64 - 0.5;
+        (part(k), part(samples.1 * k % n))
+    };
     let (w, h) = (camera.width_px as usize, camera.height_px as usize);
     let intrinsics = camera.intrinsics();
     let [cu, cv] = [intrinsics.hc, intrinsics.vc];
@@ -103,23 +123,30 @@ pub fn draw(
         turn * Vector3::y(),
         turn * Vector3::z(),
     );
+    let at = |u: f64, v: f64| {
+        let d = across * ((u - cu) / FOCAL_PX) + down * ((v - cv) / FOCAL_PX) + ahead;
+        let t = -origin.z / d.z;
+        (t > 0.0)
+            .then(|| shade(origin.x + t * d.x, origin.y + t * d.y))
+            .flatten()
+    };
     let mut picture = Vec::with_capacity(w * h);
     for v in 0..h {
         for u in 0..w {
-            let mut sum = 0.0;
+            let (u, v) = (u as f64, v as f64);
             let mut outside = None;
-            for k in 0..N * N {
-                let part = |k: usize| (k as f64 + 0.5) / N as f64 - 0.5;
-                let x = (u as f64 + part(k % N) - cu) / FOCAL_PX;
-                let y = (v as f64 + part(k / N) - cv) / FOCAL_PX;
-                let d = across * x + down * y + ahead;
-                let t = -origin.z / d.z;
-                let hit = (t > 0.0).then(|| shade(origin.x + t * d.x, origin.y + t * d.y));
-                sum += hit
-                    .flatten()
-                    .unwrap_or_else(|| *outside.get_or_insert_with(|| ground(u as f64, v as f64)));
+            let mut seen = |(x, y): (f64, f64)| {
+                at(u + x, v + y).unwrap_or_else(|| *outside.get_or_insert_with(|| ground(u, v)))
+            };
+            if samples.0 > 8 {
+                let first = seen(FEW[0]);
+                if FEW[1..].iter().all(|&place| seen(place) == first) {
+                    picture.push(first);
+                    continue;
+                }
             }
-            picture.push(sum / (N * N) as f64);
+            let sum: f64 = (0..samples.0).map(|k| seen(lattice(samples.0, k))).sum();
+            picture.push(sum / samples.0 as f64);
         }
     }
     picture

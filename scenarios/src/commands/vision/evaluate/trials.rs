@@ -17,7 +17,7 @@ use rover_vision::harris::HarrisRules;
 use rover_vision::ncc::Window;
 use rover_vision::texture::texture;
 
-use super::patch::{self, FOCAL_PX, Light};
+use super::patch::{self, EDGES, FOCAL_PX, Light};
 
 /// How a trial ended. Without an error nothing was accepted.
 pub struct Outcome {
@@ -69,7 +69,7 @@ pub const SUBJECTS: [Subject; 11] = [
         name: "harris",
         trial: harris,
         blank: None,
-        target: "none stated (interest points)",
+        target: "none stated (repeatability of interest points)",
         coordinates: 2,
     },
     Subject {
@@ -163,14 +163,14 @@ fn scene(
     rng: &mut ChaCha8Rng,
     noise_dn: f64,
     side_px: u32,
-    max_turn_rad: f64,
     shade: &dyn Fn(f64, f64) -> Option<f64>,
+    samples: patch::Samples,
 ) -> Option<(Camera, Image8, Isometry3<f64>, Vector2<f64>)> {
     let camera = patch::camera(side_px, side_px, Vector3::zeros(), 0.0);
-    let pose = patch::pose(rng, MAX_TILT_RAD, max_turn_rad);
+    let pose = patch::pose(rng, MAX_TILT_RAD, std::f64::consts::PI);
     let light = Light::random(rng);
     let ground = ground(rng);
-    let picture = patch::draw(&camera, &pose, shade, &ground);
+    let picture = patch::draw(&camera, &pose, shade, &ground, samples);
     let image = patch::expose(&picture, side_px, &light, noise_dn, rng)?;
     let truth = patch::seen(&camera, &pose, 0.0, 0.0)?;
     Some((camera, image, pose, truth))
@@ -190,40 +190,49 @@ fn first(found: Result<Finding, NoFinding>, truth: &Vector2<f64>) -> Outcome {
     found.map_or(Outcome::MISSED, |f| Outcome::of(&f, truth))
 }
 
-/// The corner of a light square, as far as the response's own pull inwards lets it be one.
+/// Repeatability: a corner of rock without noise, against the nearest one with noise.
 fn harris(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
-    let shade = |x: f64, y: f64| {
-        (x.abs().max(y.abs()) < 0.03).then_some(if x > 0.0 && y > 0.0 {
-            WHITE_DN
-        } else {
-            BLACK_DN
-        })
+    let camera = patch::camera(SIDE_PX, SIDE_PX, Vector3::zeros(), 0.0);
+    let pose = patch::pose(rng, MAX_TILT_RAD, std::f64::consts::PI);
+    let light = Light::random(rng);
+    let seed: u64 = rng.random::<u64>() >> 1;
+    let shade = move |x: f64, y: f64| Some(texture(x, y, 0.03, 0.002, 25.0, seed));
+    let picture = patch::draw(&camera, &pose, &shade, &|_, _| 110.0, patch::SMOOTH);
+    let mut corners = |noise_dn: f64| {
+        let image = patch::expose(&picture, SIDE_PX, &light, noise_dn, rng)?;
+        find::harris(&image, Window::whole(&image), &HarrisRules::default()).ok()
     };
-    let Some((_, image, _, truth)) = scene(rng, noise_dn, SIDE_PX, std::f64::consts::PI, &shade)
-    else {
+    let (Some(clean), Some(noisy)) = (corners(0.0), corners(noise_dn)) else {
         return Outcome::MISSED;
     };
-    nearest(
-        find::harris(&image, Window::whole(&image), &HarrisRules::default()),
-        &truth,
-    )
+    clean.first().map_or(Outcome::MISSED, |c| {
+        nearest(Ok(noisy), &Vector2::new(c.u_px, c.v_px))
+    })
 }
+
+/// Rim that is rendered around a picture and cut off, px.
+const RIM_PX: u32 = 6;
 
 /// A picture of rock, 31 px wide, seen straight on at another subpixel place, light and noise.
 fn template(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
     let seed: u64 = rng.random::<u64>() >> 1;
     let at = |u: f64, v: f64| texture(u, v, 32.0, 4.0, 25.0, seed);
+    // what lies beyond the picture blurs into it as well
     let mut take = |corner: Vector2<f64>, side: u32| {
-        let picture: Vec<f64> = (0..side * side)
+        let wide = side + 2 * RIM_PX;
+        let corner = corner - Vector2::repeat(f64::from(RIM_PX));
+        let picture: Vec<f64> = (0..wide * wide)
             .map(|i| {
                 at(
-                    corner.x + f64::from(i % side),
-                    corner.y + f64::from(i / side),
+                    corner.x + f64::from(i % wide),
+                    corner.y + f64::from(i / wide),
                 )
             })
             .collect();
         let light = Light::random(rng);
-        patch::expose(&picture, side, &light, noise_dn, rng)
+        let seen = patch::expose(&picture, wide, &light, noise_dn, rng)?;
+        let inner = (0..side * side).map(|i| seen.get(RIM_PX + i % side, RIM_PX + i / side));
+        Image8::from_raw(side, side, inner.collect::<Option<Vec<u8>>>()?).ok()
     };
     let whole = take(Vector2::zeros(), SIDE_PX);
     let truth =
@@ -288,7 +297,7 @@ fn warped(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
         (x.abs().max(y.abs()) < half)
             .then(|| at((x + half) * per_m - 0.5, (half - y) * per_m - 0.5))
     };
-    let made = scene(rng, noise_dn, SIDE_PX, std::f64::consts::PI, &shade);
+    let made = scene(rng, noise_dn, SIDE_PX, &shade, patch::SMOOTH);
     let pixels = (0..PICTURE_PX * PICTURE_PX)
         .map(|i| {
             let x = at(f64::from(i % PICTURE_PX), f64::from(i / PICTURE_PX));
@@ -330,7 +339,7 @@ fn blank_warped(rng: &mut ChaCha8Rng, noise_dn: f64) -> bool {
 fn disc(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
     let radius = rng.random_range(0.006..0.018);
     let shade = move |x: f64, y: f64| {
-        (x.abs().max(y.abs()) < 1.6 * radius).then(|| {
+        (x.abs().max(y.abs()) < 2.4 * radius).then(|| {
             if x.hypot(y) < radius {
                 BLACK_DN
             } else {
@@ -338,9 +347,7 @@ fn disc(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
             }
         })
     };
-    let Some((camera, image, pose, truth)) =
-        scene(rng, noise_dn, SIDE_PX, std::f64::consts::PI, &shade)
-    else {
+    let Some((camera, image, pose, truth)) = scene(rng, noise_dn, SIDE_PX, &shade, EDGES) else {
         return Outcome::MISSED;
     };
     let known = DiscTruth {
@@ -364,8 +371,7 @@ fn saddle(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
     let shade = |x: f64, y: f64| {
         (x.abs().max(y.abs()) < 0.02).then_some(if x * y > 0.0 { BLACK_DN } else { WHITE_DN })
     };
-    let Some((_, image, _, truth)) = scene(rng, noise_dn, SIDE_PX, std::f64::consts::PI, &shade)
-    else {
+    let Some((_, image, _, truth)) = scene(rng, noise_dn, SIDE_PX, &shade, EDGES) else {
         return Outcome::MISSED;
     };
     nearest(
@@ -403,8 +409,7 @@ fn apriltag(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
         let light = row.as_bytes().get(i as usize) == Some(&b'1');
         Some(if light { WHITE_DN } else { BLACK_DN })
     };
-    let Some((_, image, _, truth)) = scene(rng, noise_dn, SIDE_PX, std::f64::consts::PI, &shade)
-    else {
+    let Some((_, image, _, truth)) = scene(rng, noise_dn, SIDE_PX, &shade, EDGES) else {
         return Outcome::MISSED;
     };
     let whole = Window::whole(&image);

@@ -5,7 +5,8 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use rover_cameras::Camera;
 use rover_vision::{
-    DetectionRules, Image8, PlateLayout, PlateSearch, find, find_plate, find_saddle,
+    DetectionRules, Image8, PlateLayout, PlateSearch, PointObservation, find, find_plate,
+    find_saddle,
 };
 
 use super::super::patch;
@@ -22,37 +23,53 @@ fn plate_scene(
 ) -> Option<(Camera, Image8, Isometry3<f64>, Vector2<f64>)> {
     let layout = PlateLayout::standard(PLATE_M);
     let shade = move |x: f64, y: f64| layout.albedo(x, y).map(|a| a * WHITE_DN / 0.85);
-    scene(rng, noise_dn, PLATE_SIDE_PX, std::f64::consts::PI, &shade)
+    scene(rng, noise_dn, PLATE_SIDE_PX, &shade, patch::EDGES)
+}
+
+/// What a plate is searched for with, its rules aside, around a predicted pose.
+fn search<'a>(
+    camera: &'a Camera,
+    layout: &'a PlateLayout,
+    predicted: Isometry3<f64>,
+    rules: &'a DetectionRules,
+) -> PlateSearch<'a> {
+    PlateSearch {
+        camera,
+        layout,
+        predicted_camera_frame_from_plate: predicted,
+        search_radius_px: PLATE_RADIUS_PX,
+        rules,
+    }
+}
+
+/// The error of a point of a plate, if the detector picks one.
+fn trial(
+    rng: &mut ChaCha8Rng,
+    noise_dn: f64,
+    pick: impl FnOnce(&Image8, &PlateSearch, &mut ChaCha8Rng) -> Option<PointObservation>,
+) -> Outcome {
+    let attempt = |rng: &mut ChaCha8Rng| {
+        let (camera, image, pose, _) = plate_scene(rng, noise_dn)?;
+        let (layout, rules) = (PlateLayout::standard(PLATE_M), DetectionRules::default());
+        let search = search(&camera, &layout, spoiled(&pose, rng), &rules);
+        let point = pick(&image, &search, rng)?;
+        let at = point.point_in_plate;
+        let off = point.pixel_px - patch::seen(&camera, &pose, at.x, at.y)?;
+        Some(Outcome {
+            error_px: Some([off.x, off.y]),
+            sigma_px: point.sigma_px,
+        })
+    };
+    attempt(rng).unwrap_or(Outcome::MISSED)
 }
 
 /// Error of one point of the plate, a different one in every trial.
 pub(super) fn plate(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
-    let Some((camera, image, pose, _)) = plate_scene(rng, noise_dn) else {
-        return Outcome::MISSED;
-    };
-    let search = PlateSearch {
-        camera: &camera,
-        layout: &PlateLayout::standard(PLATE_M),
-        predicted_camera_frame_from_plate: spoiled(&pose, rng),
-        search_radius_px: PLATE_RADIUS_PX,
-        rules: &DetectionRules::default(),
-    };
-    let Ok(found) = find_plate(&image, &search) else {
-        return Outcome::MISSED;
-    };
-    let chosen = rng.random_range(0..found.points.len().max(1));
-    found
-        .points
-        .get(chosen)
-        .and_then(|p| {
-            let truth = patch::seen(&camera, &pose, p.point_in_plate.x, p.point_in_plate.y)?;
-            let off = p.pixel_px - truth;
-            Some(Outcome {
-                error_px: Some([off.x, off.y]),
-                sigma_px: p.sigma_px,
-            })
-        })
-        .unwrap_or(Outcome::MISSED)
+    trial(rng, noise_dn, |image, search, rng| {
+        let found = find_plate(image, search).ok()?;
+        let chosen = rng.random_range(0..found.points.len().max(1));
+        found.points.get(chosen).copied()
+    })
 }
 
 /// A patch without a plate, and where one is said to be.
@@ -73,34 +90,14 @@ pub(super) fn blank_plate(rng: &mut ChaCha8Rng, noise_dn: f64) -> bool {
 }
 
 pub(super) fn plate_saddle(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
-    let Some((camera, image, pose, truth)) = plate_scene(rng, noise_dn) else {
-        return Outcome::MISSED;
-    };
-    let search = PlateSearch {
-        camera: &camera,
-        layout: &PlateLayout::standard(PLATE_M),
-        predicted_camera_frame_from_plate: spoiled(&pose, rng),
-        search_radius_px: PLATE_RADIUS_PX,
-        rules: &DetectionRules::default(),
-    };
-    find_saddle(&image, &search).map_or(Outcome::MISSED, |p| {
-        let off = p.pixel_px - truth;
-        Outcome {
-            error_px: Some([off.x, off.y]),
-            sigma_px: p.sigma_px,
-        }
+    trial(rng, noise_dn, |image, search, _| {
+        find_saddle(image, search).ok()
     })
 }
 
 pub(super) fn blank_plate_saddle(rng: &mut ChaCha8Rng, noise_dn: f64) -> bool {
     blank_scene(rng, noise_dn).is_some_and(|(camera, pose, image)| {
-        let search = PlateSearch {
-            camera: &camera,
-            layout: &PlateLayout::standard(PLATE_M),
-            predicted_camera_frame_from_plate: pose,
-            search_radius_px: PLATE_RADIUS_PX,
-            rules: &DetectionRules::default(),
-        };
-        find_saddle(&image, &search).is_ok()
+        let (layout, rules) = (PlateLayout::standard(PLATE_M), DetectionRules::default());
+        find_saddle(&image, &search(&camera, &layout, pose, &rules)).is_ok()
     })
 }

@@ -39,7 +39,7 @@ fn plane_pair(rng: &mut ChaCha8Rng, noise_dn: f64, size: (u32, u32)) -> Option<P
     let shade = move |x: f64, y: f64| Some(texture(x, y, 0.064, 0.0015, 18.0, seed));
     let light = Light::random(rng);
     let mut take = |camera: &Camera| {
-        let picture = patch::draw(camera, &pose, &shade, &|_, _| 110.0);
+        let picture = patch::draw(camera, &pose, &shade, &|_, _| 110.0, patch::SMOOTH);
         patch::expose(&picture, size.0, &light, noise_dn, rng)
     };
     let (left, right) = (take(&pair.left)?, take(&pair.right)?);
