@@ -70,8 +70,8 @@ fn the_json_has_exactly_the_fields_of_the_interface() {
     assert_eq!(
         keys(&value),
         [
-            "contact", "digest", "outcome", "phases", "reason", "robot", "scenario", "seed",
-            "servo", "target", "truth"
+            "approach", "contact", "digest", "outcome", "phases", "reason", "robot", "scenario",
+            "seed", "servo", "target", "truth"
         ]
     );
     assert_eq!(
@@ -111,7 +111,8 @@ fn the_json_has_exactly_the_fields_of_the_interface() {
             "axis_error_deg",
             "lateral_error_mm",
             "open_loop_lateral_error_mm",
-            "range_error_mm"
+            "range_error_mm",
+            "sources"
         ]
     );
     assert_eq!(value["outcome"], "placed");
@@ -130,7 +131,7 @@ fn the_digest_is_the_same_on_every_machine() {
     assert_eq!(report().digest, GOLDEN);
 }
 
-const GOLDEN: &str = "0b0060d8eb2f8c12dc11193af91db4d72f0a9ff699f1c154da265e8e1bab0f13";
+const GOLDEN: &str = "9fecda8bd53b3c4ad0a2ac092bba9ecf04896efaaa153b40d7ca49d0dc2a9ad7";
 
 #[test]
 fn wall_times_do_not_change_the_digest_and_anything_else_does() {

@@ -18,7 +18,7 @@ pixel_px = [320.0, 240.0]
 
 fn load(sets: &[&str]) -> Result<LoadedScenario, ScenarioError> {
     let sets: Vec<String> = sets.iter().map(|s| (*s).to_owned()).collect();
-    LoadedScenario::load(embedded::DEFAULT_SCENARIO, &sets, None)
+    LoadedScenario::load("scenarios/bluestreak.toml", &sets, None)
 }
 
 fn message(sets: &[&str]) -> String {

@@ -444,7 +444,7 @@ mod tests {
         for r in &study.references {
             let near = r.points.first().unwrap();
             assert!(
-                near.distance_m < 1e-9 && near.error_mm < 2.0,
+                near.distance_m < 1e-9 && near.error_mm < 0.5 * near.open_loop_mm,
                 "{}: {near:?}",
                 r.name
             );

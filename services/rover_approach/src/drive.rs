@@ -165,30 +165,49 @@ pub fn towards_pose(
     if distance <= rules.min_step_m.max(0.04) {
         return (pose.heading_rad.abs() > 0.02).then(|| turn(bounded(pose.heading_rad)));
     }
-    let bearing = place.y.atan2(place.x);
-    let (aim, sign) = if bearing.abs() <= std::f64::consts::FRAC_PI_2 {
-        (bearing, 1.0)
-    } else {
-        (bearing - std::f64::consts::PI.copysign(bearing), -1.0)
-    };
+    let (aim, sign) = aim_of(&place);
     // the whole way must be clear, though only its beginning is driven
-    let steps = (distance / rules.check_m).ceil().max(1.0) as u32;
-    let clear = (1..=steps).all(|k| {
-        let part = f64::from(k) / f64::from(steps);
-        let at = PlanarPose {
-            x_m: place.x * part,
-            y_m: place.y * part,
-            heading_rad: aim,
-        };
-        map.standing(&at, mobility, rules.max_slope_rad).is_ok()
-    });
-    if !clear {
+    if hazard_on_the_way(pose, map, mobility, rules).is_some() {
         return None;
     }
     if aim.abs() > AIM_RAD && distance > 0.08 {
         return Some(turn(bounded(aim)));
     }
     Some(straight(sign * distance.min(step_m)))
+}
+
+/// The first hazard on the straight way to a pose, and how far away it is, m.
+#[must_use]
+pub fn hazard_on_the_way(
+    pose: &PlanarPose,
+    map: &GroundMap,
+    mobility: &MobilityDescription,
+    rules: &DriveRules,
+) -> Option<(f64, Hazard)> {
+    let place = Vector2::new(pose.x_m, pose.y_m);
+    let distance = place.norm();
+    let heading_rad = aim_of(&place).0;
+    let steps = (distance / rules.check_m).ceil().max(1.0) as u32;
+    (1..=steps).find_map(|k| {
+        let part = f64::from(k) / f64::from(steps);
+        let at = PlanarPose {
+            x_m: place.x * part,
+            y_m: place.y * part,
+            heading_rad,
+        };
+        let standing = map.standing(&at, mobility, rules.max_slope_rad);
+        standing.err().map(|hazard| (distance * part, hazard))
+    })
+}
+
+/// Heading in which a place is driven to, and 1 for forwards or -1 for backwards.
+fn aim_of(place: &Vector2<f64>) -> (f64, f64) {
+    let bearing = place.y.atan2(place.x);
+    if bearing.abs() <= std::f64::consts::FRAC_PI_2 {
+        (bearing, 1.0)
+    } else {
+        (bearing - std::f64::consts::PI.copysign(bearing), -1.0)
+    }
 }
 
 /// A straight movement, backwards where the length is negative.

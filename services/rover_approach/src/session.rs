@@ -37,6 +37,8 @@ const STANDOFF_M: f64 = 1.1;
 const HAZARD_LOOK_M: f64 = 2.0;
 /// Pixels between the points of the ground map.
 const MAP_STEP_PX: u32 = 16;
+/// What the mast sees so near to the rover is the rover itself, m.
+const OWN_M: f64 = 0.08;
 /// Frames whose points are kept.
 const MAP_FRAMES: usize = 6;
 /// Most stops if the goal does not say.
@@ -496,8 +498,14 @@ impl<'a> Session<'a> {
         };
         let points = sparse_points(&view.left, &view.right, &view.cameras, MAP_STEP_PX, &rules);
         let Ok(points) = points else { return };
+        let [half_x, half_y] = self.mobility.footprint_half_m;
+        let own = |p: &Vector3<f64>| {
+            let below = p.x.abs() < half_x + OWN_M && p.y.abs() < half_y + OWN_M;
+            below || self.shade.touches(p, OWN_M)
+        };
         let in_site = points
             .iter()
+            .filter(|(_, p)| !own(p))
             .map(|(_, p)| (site_from_rover.isometry * Point3::from(*p)).coords)
             .collect();
         self.ground.push(in_site);

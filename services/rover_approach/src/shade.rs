@@ -49,6 +49,14 @@ impl Shade {
         })
     }
 
+    /// Whether a point lies within `margin_m` of a part of the rover, rover frame.
+    #[must_use]
+    pub fn touches(&self, point_m: &Vector3<f64>, margin_m: f64) -> bool {
+        self.capsules
+            .iter()
+            .any(|(a, b, radius)| point_to_segment(point_m, a, b) < radius + margin_m)
+    }
+
     /// Whether the sun's ray to `point_m` passes within `margin_m` of the rover. Point and `sun`
     /// (unit, towards the sun) in the rover frame.
     #[must_use]

@@ -78,7 +78,7 @@ fn a_mistyped_or_impossible_setting_is_refused_with_exit_2() {
 fn a_scenario_file_with_a_misspelt_field_is_refused_with_file_line_and_field() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("mine.toml");
-    let text = String::from_utf8(rover(&["run", "--print"]).stdout).unwrap();
+    let text = String::from_utf8(rover(&["run", TESTBED, "--print"]).stdout).unwrap();
     assert!(text.contains("pixel_px"));
     std::fs::write(&file, text.replace("pixel_px", "pixel_mm")).unwrap();
     refused(

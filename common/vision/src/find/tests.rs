@@ -62,7 +62,8 @@ impl Rig {
             &mut picture,
             &self.rays,
             (u0, v0, side, side),
-            6,
+            // finer than the least misfit that the rules tell from noise
+            16,
             &|o, d| {
                 let p = synthetic::hit_plane(pose, o, d)?;
                 shade(p.x, p.y)

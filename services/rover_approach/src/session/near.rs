@@ -2,7 +2,7 @@
 
 use super::Session;
 use crate::base_pose::{BaseChoice, BaseRules, BaseTask, Serving, TargetSpot};
-use crate::drive::{Movement, next_movement, straight, towards_pose};
+use crate::drive::{Movement, hazard_on_the_way, next_movement, straight, towards_pose};
 use crate::hardware::fault;
 use crate::obstacles::{GroundMap, PlanarPose};
 use crate::service::unfit;
@@ -87,13 +87,20 @@ impl Session<'_> {
         match (movement, here) {
             (Some(movement), _) => Ok(NearStep::Move(movement.arc)),
             (None, Ok(serving)) => Ok(NearStep::Stay(serving, choice)),
-            (None, Err(reason)) => Err(fault(
-                "path_blocked",
-                format!(
-                    "no way is clear to any of {} base poses; where the rover stands: {reason}",
-                    choice.serving.len()
-                ),
-            )),
+            (None, Err(reason)) => {
+                let n = choice.serving.len();
+                let nearest = choice.serving.first().and_then(|best| {
+                    hazard_on_the_way(&best.pose, &map, self.mobility, &self.rules)
+                });
+                let what = nearest.map_or_else(String::new, |(away_m, hazard)| {
+                    format!("; on the way to the best one, {away_m:.2} m away: {hazard}")
+                });
+                let message = format!(
+                    "no way is clear to any of {n} base poses{what}; where the rover stands: \
+                     {reason}"
+                );
+                Err(fault("path_blocked", message).with("range_m", range_m))
+            }
         }
     }
 
