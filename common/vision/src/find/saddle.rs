@@ -52,7 +52,7 @@ impl Default for SaddleRules {
             smoothing_px: 1.5,
             min_contrast_dn: 20.0,
             min_score: 0.93,
-            max_residual_fraction: 0.02,
+            max_residual_fraction: 0.035,
             noise_dn: 6.0,
             min_sine: 0.35,
             max_blur_px: 1.6,

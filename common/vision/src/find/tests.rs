@@ -62,8 +62,7 @@ impl Rig {
             &mut picture,
             &self.rays,
             (u0, v0, side, side),
-            // finer than the least misfit that the rules tell from noise
-            16,
+            10,
             &|o, d| {
                 let p = synthetic::hit_plane(pose, o, d)?;
                 shade(p.x, p.y)
