@@ -21,7 +21,7 @@ use rover_messages::{
         DesignateRequest, InjectedFault, PickRequest, ScoreRequest, StepRequest, ViewRequest,
     },
 };
-use rover_service::{Service, ServiceShell};
+use rover_service::{Service, ServiceShell, Starting};
 use std::{
     sync::{Arc, Mutex},
     time::Duration,
@@ -105,7 +105,11 @@ impl Pace {
 ///
 /// # Errors
 /// [`BusError`] when a key cannot be declared or the hardware is present already.
-pub async fn serve(peer: &Peer, world: World, options: Options) -> Result<Hardware, BusError> {
+pub fn serve(peer: &Peer, world: World, options: Options) -> Starting<'_, Hardware> {
+    Box::pin(start(peer, world, options))
+}
+
+async fn start(peer: &Peer, world: World, options: Options) -> Result<Hardware, BusError> {
     let robot = world.robot().clone();
     let shell = ServiceShell::new(peer, &robot, HARDWARE).await?;
     let states = Arc::new(peer.stream(keys::ARM_STATE).await?);

@@ -4,7 +4,6 @@
 mod approach;
 mod bullseye;
 mod picture;
-pub(crate) mod plot;
 mod timeline;
 
 use crate::{
@@ -13,17 +12,13 @@ use crate::{
     scenario::LoadedScenario,
 };
 use picture::{Mark, Overlay, figure};
-use plot::{Marks, Plot, Series};
 use rover_messages::placement::Look;
+use rover_page::{
+    BLUE, GREEN, ORANGE, PURPLE, YELLOW, document, escape,
+    plot::{Marks, Plot, Series},
+    section,
+};
 use std::fmt::Write;
-
-const STYLE: &str = include_str!("html/page.css");
-/// Colours that remain distinct for colour-blind readers.
-pub(crate) const BLUE: &str = "#0072b2";
-pub(crate) const ORANGE: &str = "#d55e00";
-pub(crate) const GREEN: &str = "#009e73";
-pub(crate) const PURPLE: &str = "#aa4499";
-const YELLOW: &str = "#ffd21f";
 
 /// Why a page could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -73,17 +68,6 @@ pub fn page(
     Ok(document(&title, &body, &footer))
 }
 
-/// A self-contained page; `title` is text, `body` and `footer` are HTML.
-pub(crate) fn document(title: &str, body: &str, footer: &str) -> String {
-    format!(
-        "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
-         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
-         <title>{}</title><style>{STYLE}</style></head>\n<body><main>\n{body}\
-         <footer>{footer}</footer>\n</main></body></html>\n",
-        escape(title)
-    )
-}
-
 fn outcome(report: &RunReport) -> &'static str {
     match report.outcome {
         Outcome::Placed => "placed",
@@ -102,10 +86,6 @@ fn header(report: &RunReport, description: &str) -> String {
         escape(&report.scenario),
         escape(description)
     )
-}
-
-pub(crate) fn section(title: &str, content: &str) -> String {
-    format!("<section><h2>{title}</h2>\n{content}\n</section>\n")
 }
 
 fn card(name: &str, value: &str, unit: &str, note: &str) -> String {
@@ -451,12 +431,4 @@ fn truth(report: &RunReport, evidence: &Evidence) -> String {
         )
     });
     format!("<div class=\"truth\"><table>{rows}</table>{drawn}</div>")
-}
-
-/// Text as HTML.
-pub(crate) fn escape(text: &str) -> String {
-    text.replace('&', "&amp;")
-        .replace('<', "&lt;")
-        .replace('>', "&gt;")
-        .replace('"', "&quot;")
 }

@@ -10,7 +10,7 @@
 //! | [`report`] | what did the run come to |
 //! | [`campaign`] | what do many runs come to |
 //! | [`html`] | how does a person see it |
-//! | [`study`] | what does the method achieve, and the others |
+//! | [`rover_study`] | what does the method achieve, and the others |
 //! | [`tables`] | how do numbers come in from files and go out again |
 //! | [`registry`] | what is this payload on the network |
 
@@ -26,5 +26,4 @@ pub mod progress;
 pub mod registry;
 pub mod report;
 pub mod scenario;
-pub mod study;
 pub mod tables;

@@ -9,6 +9,7 @@ use crate::{
 use rover_messages::{Fault, codec::MAX_PAYLOAD_BYTES};
 use std::{
     collections::HashMap,
+    pin::Pin,
     sync::{
         Arc, Mutex,
         atomic::{AtomicBool, AtomicU64},
@@ -17,6 +18,7 @@ use std::{
 };
 use tokio::{
     sync::{mpsc, watch},
+    task::JoinHandle,
     time::{Instant, sleep_until, timeout_at},
 };
 use zenoh::{
@@ -43,13 +45,28 @@ impl std::fmt::Debug for Peer {
     }
 }
 
+/// The runtime on which a peer's tasks run.
+#[derive(Clone)]
+pub(crate) struct Tasks(tokio::runtime::Handle);
+
+impl Tasks {
+    /// Starts a task. Its own type is forgotten, so that tokio's part is compiled once.
+    pub(crate) fn spawn(&self, task: impl Future<Output = ()> + Send + 'static) -> JoinHandle<()> {
+        self.spawn_boxed(Box::pin(task))
+    }
+
+    fn spawn_boxed(&self, task: Pin<Box<dyn Future<Output = ()> + Send>>) -> JoinHandle<()> {
+        self.0.spawn(task)
+    }
+}
+
 pub(crate) struct Inner {
     pub(crate) session: Session,
     pub(crate) name: Arc<str>,
     pub(crate) namespace: String,
     /// Zenoh's identity of this session, different at every start.
     pub(crate) id: String,
-    pub(crate) runtime: tokio::runtime::Handle,
+    pub(crate) runtime: Tasks,
     pub(crate) roll: Arc<Roll>,
     pub(crate) goals: AtomicU64,
     /// Whether this peer has, or is about to have, its presence announced.
@@ -129,7 +146,7 @@ impl Peer {
                 namespace: namespace.unwrap_or_default(),
                 id: session.zid().to_string(),
                 session,
-                runtime: tokio::runtime::Handle::current(),
+                runtime: Tasks(tokio::runtime::Handle::current()),
                 roll,
                 goals: AtomicU64::new(0),
                 claims,

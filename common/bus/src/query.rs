@@ -11,6 +11,7 @@ use std::{
     future::Future,
     panic::{AssertUnwindSafe, catch_unwind},
     pin::Pin,
+    sync::Arc,
     task::{Context, Poll},
 };
 use tokio::sync::mpsc;
@@ -43,18 +44,19 @@ impl std::fmt::Debug for Served {
     }
 }
 
-/// Runs a future to its end or to its panic.
-pub(crate) struct Contained<F>(Pin<Box<F>>);
+/// Runs a future to its end or to its panic. The future's own type is forgotten here, so that what
+/// waits for a handler is compiled once per answer and not once per handler.
+pub(crate) struct Contained<T>(Pin<Box<dyn Future<Output = T> + Send>>);
 
-impl<F> Contained<F> {
-    pub(crate) fn new(future: F) -> Self {
+impl<T> Contained<T> {
+    pub(crate) fn new(future: impl Future<Output = T> + Send + 'static) -> Self {
         Self(Box::pin(future))
     }
 }
 
-impl<F: Future> Future for Contained<F> {
+impl<T> Future for Contained<T> {
     /// The text of the panic as error.
-    type Output = Result<F::Output, String>;
+    type Output = Result<T, String>;
 
     fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Self::Output> {
         let poll = || self.0.as_mut().poll(cx);
@@ -152,13 +154,17 @@ impl Peer {
     {
         let desk = self.inner.desk(key)?;
         let (queryable, mut queries) = self.inner.queued(&desk).await?;
+        let handler = Arc::new(handler);
         self.inner.runtime.spawn(async move {
             while let Some(query) = queries.recv().await {
                 let format = asked_format(&query);
                 let answer = match question::<Q>(&query, limit_bytes, &desk.name) {
-                    Ok(question) => Contained::new(async { handler(question).await })
-                        .await
-                        .unwrap_or_else(|text| Err(desk.fault("internal_error", text))),
+                    Ok(question) => Contained::new({
+                        let handler = handler.clone();
+                        async move { handler(question).await }
+                    })
+                    .await
+                    .unwrap_or_else(|text| Err(desk.fault("internal_error", text))),
                     Err(fault) => Err(fault),
                 };
                 match answer {

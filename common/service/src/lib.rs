@@ -21,11 +21,16 @@ use rover_messages::{
 use rover_robot::Robot;
 use std::{
     fmt,
+    pin::Pin,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
 };
 
 /// State of a service that waits for something to do.
 pub const READY: &str = "ready";
+
+/// A service that comes up. Boxed, so that it is compiled where it is written and not where it is
+/// started.
+pub type Starting<'a, T> = Pin<Box<dyn Future<Output = Result<T, BusError>> + Send + 'a>>;
 
 /// Bookkeeping of one service: what it does, what it has counted, its last fault. Cheap to clone;
 /// all clones are the same service. Every change is published on `<service>/status`.

@@ -1,13 +1,11 @@
 //! A campaign as one self-contained page.
 
 use super::{Record, Summary, summary::Spread};
-use crate::{
-    html::{
-        BLUE, ORANGE, document, escape,
-        plot::{Marks, Plot, Series},
-        section,
-    },
-    report::Outcome,
+use crate::report::Outcome;
+use rover_page::{
+    BLUE, ORANGE, document, escape,
+    plot::{Marks, Plot, Series},
+    section,
 };
 use std::fmt::Write;
 

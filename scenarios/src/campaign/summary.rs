@@ -1,10 +1,8 @@
 //! What the runs of a campaign came to, taken together.
 
 use super::Record;
-use crate::{
-    report::{Outcome, RunReport},
-    study::statistics::quantile,
-};
+use crate::report::{Outcome, RunReport};
+use rover_study::statistics::quantile;
 use serde::Serialize;
 use std::collections::BTreeMap;
 

@@ -1,10 +1,8 @@
 //! `rover study`: the paper's analysis, carried out again.
 
 use super::{CommandError, Exit};
-use crate::{
-    output::{Output, print},
-    study::{self, StudyConfig, StudyError, StudyReport},
-};
+use crate::output::{Output, print};
+use rover_study::{self as studies, StudyConfig, StudyError, StudyReport};
 use std::path::PathBuf;
 
 /// Which study.
@@ -102,30 +100,32 @@ fn study(args: &StudyArgs) -> Result<StudyReport, StudyError> {
     let all = args.which == Which::All;
     let mut report = StudyReport::new(args.seed, all);
     if all || args.which == Which::Table1 {
-        report.table1 = Some(study::table1::table1(&config(study::table1::PAPER_TRIALS))?);
+        report.table1 = Some(studies::table1::table1(&config(
+            studies::table1::PAPER_TRIALS,
+        ))?);
     }
     if all || args.which == Which::Locality {
-        let trials = config(study::locality::PAPER_TRIALS);
-        report.locality = Some(study::locality::locality(&trials)?);
+        let trials = config(studies::locality::PAPER_TRIALS);
+        report.locality = Some(studies::locality::locality(&trials)?);
     }
     if all || args.which == Which::Experiment {
-        let trials = config(study::experiment::TRIALS);
-        report.experiment = Some(study::experiment::experiment(&trials)?);
+        let trials = config(studies::experiment::TRIALS);
+        report.experiment = Some(studies::experiment::experiment(&trials)?);
     }
     if all || args.which == Which::Sensitivity {
-        let trials = config(study::sensitivity::TRIALS);
-        report.sensitivity = Some(study::sensitivity::sensitivity(&trials)?);
+        let trials = config(studies::sensitivity::TRIALS);
+        report.sensitivity = Some(studies::sensitivity::sensitivity(&trials)?);
     }
     if all || args.which == Which::Compare {
-        let trials = config(study::compare::TRIALS);
-        report.compare = Some(study::compare::compare(
+        let trials = config(studies::compare::TRIALS);
+        report.compare = Some(studies::compare::compare(
             &trials,
-            &study::compare::Case::ALL,
-            &study::compare::OCCLUSIONS_CM,
+            &studies::compare::Case::ALL,
+            &studies::compare::OCCLUSIONS_CM,
         )?);
     }
     if all || args.which == Which::Cost {
-        report.cost = Some(study::cost::cost(&config(study::cost::TRIALS))?);
+        report.cost = Some(studies::cost::cost(&config(studies::cost::TRIALS))?);
     }
     Ok(report)
 }

@@ -1,12 +1,15 @@
 //! The approach as a strip of pictures, the tracking in plots, the error by source.
 
 use super::{
-    BLUE, ORANGE, PURPLE, PageError, YELLOW, escape,
+    PageError,
     picture::{Mark, Overlay, figure},
+};
+use crate::{evidence::Evidence, report::RunReport};
+use rover_page::{
+    BLUE, ORANGE, PURPLE, YELLOW, escape,
     plot::{Marks, Plot, Series},
     section,
 };
-use crate::{evidence::Evidence, report::RunReport};
 use std::fmt::Write;
 
 /// Pictures in the strip; of more stops than that, evenly spaced ones are shown.

@@ -1,9 +1,10 @@
 //! Pictures with marks drawn over them.
 
-use super::{PageError, escape};
+use super::PageError;
 use base64::{Engine, engine::general_purpose::STANDARD};
 use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 use rover_messages::imaging::ImageData;
+use rover_page::{YELLOW, escape};
 use std::fmt::Write;
 
 /// What is drawn over a picture, px; (0, 0) is the centre of the first pixel.
@@ -92,14 +93,14 @@ pub(super) fn figure(
             .collect();
         let _ = write!(
             drawn,
-            "<polyline points=\"{}\" fill=\"none\" stroke=\"#ffd21f\" stroke-width=\"1.4\" stroke-opacity=\".8\" stroke-dasharray=\"4 3\"/>",
+            "<polyline points=\"{}\" fill=\"none\" stroke=\"{YELLOW}\" stroke-width=\"1.4\" stroke-opacity=\".8\" stroke-dasharray=\"4 3\"/>",
             points.join(" ")
         );
     }
     for [u, v] in &overlay.path {
         let _ = write!(
             drawn,
-            "<circle cx=\"{u:.2}\" cy=\"{v:.2}\" r=\"2.4\" fill=\"#ffd21f\"/>"
+            "<circle cx=\"{u:.2}\" cy=\"{v:.2}\" r=\"2.4\" fill=\"{YELLOW}\"/>"
         );
     }
     for mark in &overlay.marks {

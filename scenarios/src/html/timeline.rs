@@ -1,7 +1,7 @@
 //! The phases of a run over simulated time.
 
-use super::escape;
 use crate::report::Phase;
+use rover_page::escape;
 use std::fmt::Write;
 
 const WIDTH: f64 = 960.0;

@@ -10,7 +10,7 @@ use rover_messages::{
     planning::{Plan, PlanRequest, SurveyReport, SurveyRequest},
 };
 use rover_robot::{CameraPairDescription, Robot};
-use rover_service::{Service, ServiceShell, frames};
+use rover_service::{Service, ServiceShell, Starting, frames};
 use rover_vision::{MatchRules, sparse_points};
 use std::{
     sync::{Arc, Mutex, PoisonError},
@@ -26,7 +26,11 @@ const SURVEY_STEP_PX: u32 = 10;
 ///
 /// # Errors
 /// [`BusError`] when a key cannot be declared or the name is taken.
-pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
+pub fn serve(peer: &Peer, robot: Arc<Robot>) -> Starting<'_, Service> {
+    Box::pin(start(peer, robot))
+}
+
+async fn start(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
     let shell = ServiceShell::new(peer, &robot, SERVICE).await?;
     let desk = Desk {
         peer: peer.clone(),

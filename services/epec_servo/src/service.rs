@@ -17,7 +17,7 @@ use rover_messages::{
 };
 use rover_robot::Robot;
 use rover_service::{
-    Service, ServiceShell,
+    Service, ServiceShell, Starting,
     motion::{ArmClient, interrupted},
 };
 use std::{sync::Arc, time::Duration};
@@ -29,7 +29,11 @@ const FRAME_LIMIT: Duration = Duration::from_secs(60);
 ///
 /// # Errors
 /// [`BusError`] when a key cannot be declared or the name is taken.
-pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
+pub fn serve(peer: &Peer, robot: Arc<Robot>) -> Starting<'_, Service> {
+    Box::pin(start(peer, robot))
+}
+
+async fn start(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
     let shell = ServiceShell::new(peer, &robot, EPEC_SERVO).await?;
     let servo = Servo {
         arm: ArmClient::new(peer, EPEC_SERVO),

@@ -9,14 +9,18 @@ use rover_messages::{
     keys::{self, service::ROVER_APPROACH},
 };
 use rover_robot::Robot;
-use rover_service::{Service, ServiceShell};
+use rover_service::{Service, ServiceShell, Starting};
 use std::{sync::Arc, time::Duration};
 
 /// Starts the service on `peer`; it lives as long as the returned value.
 ///
 /// # Errors
 /// [`BusError`] when a key cannot be declared or the name is taken.
-pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
+pub fn serve(peer: &Peer, robot: Arc<Robot>) -> Starting<'_, Service> {
+    Box::pin(start(peer, robot))
+}
+
+async fn start(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
     let shell = ServiceShell::new(peer, &robot, ROVER_APPROACH).await?;
     let approach = Approach {
         peer: peer.clone(),

@@ -7,14 +7,18 @@ use rover_messages::{
     target::{SelectRequest, Target},
 };
 use rover_robot::Robot;
-use rover_service::{Service, ServiceShell, frames};
+use rover_service::{Service, ServiceShell, Starting, frames};
 use std::sync::Arc;
 
 /// Starts the service on `peer`; it lives as long as the returned value.
 ///
 /// # Errors
 /// [`BusError`] when a key cannot be declared or the name is taken.
-pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
+pub fn serve(peer: &Peer, robot: Arc<Robot>) -> Starting<'_, Service> {
+    Box::pin(start(peer, robot))
+}
+
+async fn start(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
     let shell = ServiceShell::new(peer, &robot, SERVICE).await?;
     let desk = Arc::new(Desk {
         peer: peer.clone(),

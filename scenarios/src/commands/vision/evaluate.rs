@@ -1,19 +1,13 @@
 //! `rover vision evaluate`: bias, sigma, detection and false-accept rates of every detector and of
 //! the matcher, over rendered patches, beside the targets.
 
-mod patch;
-mod trials;
-
 use std::fmt::Write;
 use std::path::PathBuf;
-
-use rayon::prelude::*;
-use serde::Serialize;
 
 use super::input;
 use crate::commands::{CommandError, Exit};
 use crate::output::{Output, print};
-use trials::{Outcome, SUBJECTS, Subject};
+use rover_study::detectors::{NOISES_DN, Row, SUBJECTS, Subject, evaluate};
 
 /// Measures bias, sigma, detection and false-accept rates of the detectors and of the matcher
 ///
@@ -38,38 +32,6 @@ pub struct EvaluateArgs {
     #[arg(long)]
     force: bool,
 }
-
-/// One row of the table.
-#[derive(Clone, Debug, Serialize)]
-struct Row {
-    name: &'static str,
-    noise_dn: f64,
-    patches: u32,
-    detected_percent: f64,
-    /// Mean error in u and v, px.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    bias_px: Option<[f64; 2]>,
-    /// Standard deviation per coordinate, px.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    sigma_px: Option<f64>,
-    /// The error's length that 95 % stay below, px.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    p95_px: Option<f64>,
-    /// Errors per stated standard deviation, rms (1 is honest).
-    #[serde(skip_serializing_if = "Option::is_none")]
-    stated: Option<f64>,
-    /// Accepted fiducials more than `gross_px` off.
-    gross: u32,
-    gross_px: f64,
-    /// Patches without the fiducial, and those in which one was seen.
-    blanks: u32,
-    false_accepts: u32,
-    target: &'static str,
-}
-
-const NOISES_DN: [f64; 2] = [1.0, 5.0];
-/// Accepted results farther off are counted by themselves and not in bias and sigma, px.
-const GROSS_PX: f64 = 1.0;
 
 /// Runs the command.
 pub fn run(args: &EvaluateArgs) -> Result<Exit, CommandError> {
@@ -108,64 +70,6 @@ pub fn run(args: &EvaluateArgs) -> Result<Exit, CommandError> {
         input::write_json(&out, &rows)?;
     }
     Ok(Exit::Done)
-}
-
-/// Trials of one subject at one noise: half of `patches`, rounded up for the first noise.
-fn evaluate(subject: &Subject, noise_dn: f64, patches: u32, k: usize, stream: u64) -> Row {
-    let share = if k == 0 {
-        patches.div_ceil(2)
-    } else {
-        patches / 2
-    };
-    let outcomes: Vec<Outcome> = (0..share)
-        .into_par_iter()
-        .map(|i| (subject.trial)(&mut patch::rng(stream, u64::from(i)), noise_dn))
-        .collect();
-    let blanks = if subject.blank.is_some() { share } else { 0 };
-    let false_accepts = subject.blank.map_or(0, |blank| {
-        (0..share)
-            .into_par_iter()
-            .filter(|&i| blank(&mut patch::rng(stream, (1 << 32) + u64::from(i)), noise_dn))
-            .count() as u32
-    });
-    let found: Vec<&Outcome> = outcomes.iter().filter(|o| o.error_px.is_some()).collect();
-    let gross = found.iter().filter(|o| o.size() > GROSS_PX).count();
-    let good: Vec<(f64, f64, f64)> = found
-        .iter()
-        .filter(|o| o.size() <= GROSS_PX)
-        .filter_map(|o| o.error_px.map(|[u, v]| (u, v, o.sigma_px)))
-        .collect();
-    let n = good.len() as f64;
-    let mut row = Row {
-        name: subject.name,
-        noise_dn,
-        patches: share,
-        detected_percent: 100.0 * found.len() as f64 / f64::from(share.max(1)),
-        bias_px: None,
-        sigma_px: None,
-        p95_px: None,
-        stated: None,
-        gross: gross as u32,
-        gross_px: GROSS_PX,
-        blanks,
-        false_accepts,
-        target: subject.target,
-    };
-    if good.len() < 2 {
-        return row;
-    }
-    let mean = |f: &dyn Fn(&(f64, f64, f64)) -> f64| good.iter().map(f).sum::<f64>() / n;
-    let bias = [mean(&|e| e.0), mean(&|e| e.1)];
-    let coordinates = f64::from(subject.coordinates);
-    let square = mean(&|e| (e.0 - bias[0]).powi(2) + (e.1 - bias[1]).powi(2));
-    let mut sizes: Vec<f64> = good.iter().map(|e| e.0.hypot(e.1)).collect();
-    sizes.sort_by(f64::total_cmp);
-    row.bias_px = Some(bias);
-    row.sigma_px = Some((square / coordinates).sqrt());
-    row.p95_px = sizes.get((0.95 * n) as usize).copied();
-    let stated = mean(&|e| (e.0 * e.0 + e.1 * e.1) / (coordinates * e.2 * e.2));
-    row.stated = stated.is_finite().then(|| stated.sqrt());
-    row
 }
 
 fn table(rows: &[Row]) -> String {

@@ -10,16 +10,20 @@ const TOP: f64 = 48.0;
 const BOTTOM: f64 = 40.0;
 
 /// One line.
-pub(crate) struct Series {
+pub struct Series {
+    /// What it is called.
     pub name: &'static str,
+    /// CSS colour.
     pub colour: &'static str,
+    /// x and y.
     pub points: Vec<(f64, f64)>,
+    /// How its points are drawn.
     pub marks: Marks,
 }
 
 /// How the points of a series are drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Marks {
+pub enum Marks {
     /// Dots joined by a line.
     Joined,
     /// Dots alone.
@@ -29,14 +33,18 @@ pub(crate) enum Marks {
 }
 
 /// Some lines over common axes.
-pub(crate) struct Plot {
+pub struct Plot {
+    /// Title.
     pub title: &'static str,
+    /// What x is, with its unit.
     pub x_label: &'static str,
+    /// What y is, with its unit.
     pub y_label: &'static str,
     /// Ticks of x at whole numbers only.
     pub whole_x: bool,
     /// The y axis begins at zero.
     pub from_zero: bool,
+    /// The lines.
     pub series: Vec<Series>,
 }
 

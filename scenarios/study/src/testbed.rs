@@ -6,7 +6,6 @@
 //! flat floor with no rock, so that whatever a method sees or misses is its own doing.
 
 use super::StudyError;
-use crate::{embedded, scenario::Scenario};
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Unit, UnitQuaternion, Vector3};
 use rover_compensation::{Compensation, ErrorModel};
 use rover_epec_servo::{
@@ -25,6 +24,7 @@ use rover_messages::{
 };
 use rover_robot::Robot;
 use rover_sim::{IntrinsicsError, SimulationDescription, SimulationError, StillWorld};
+use serde::Deserialize;
 use std::{collections::BTreeMap, sync::Arc, time::Instant};
 
 /// The pair that sees the arm.
@@ -35,6 +35,17 @@ const START: &str = "ready";
 const FLOOR_M: f64 = 0.0;
 /// Steps after which a placement that has not ended is a fault.
 const MOST_STEPS: u32 = 400;
+
+/// The shipped robot of the testbed.
+const ROBOT: &str = include_str!("../../robots/bluestreak.toml");
+/// The shipped scenario of the testbed.
+const SCENARIO: &str = include_str!("../../bluestreak.toml");
+
+/// What a study takes of a scenario: the simulated world.
+#[derive(Deserialize)]
+struct World {
+    simulation: SimulationDescription,
+}
 
 /// What all draws of the testbed have in common.
 #[derive(Clone, Debug)]
@@ -51,15 +62,10 @@ impl Testbed {
     /// # Errors
     /// [`StudyError::Shipped`] never, for a binary that passes its tests.
     pub fn bluestreak(intrinsics: IntrinsicsError) -> Result<Self, StudyError> {
-        let shipped = |files, name: &'static str| {
-            embedded::find(files, name).ok_or_else(|| StudyError::Shipped(format!("no {name}")))
-        };
-        let (origin, text) = shipped(embedded::ROBOTS, "robots/bluestreak.toml")?;
-        let robot = Robot::parse(text, origin).map_err(|e| StudyError::Shipped(e.to_string()))?;
-        let (origin, text) = shipped(embedded::SCENARIOS, "scenarios/bluestreak.toml")?;
-        let scenario =
-            Scenario::parse(text, origin).map_err(|e| StudyError::Shipped(e.to_string()))?;
-        let mut description = scenario.simulation;
+        let unusable = |e: &dyn std::fmt::Display| StudyError::Shipped(e.to_string());
+        let robot = Robot::parse(ROBOT, "robots/bluestreak.toml").map_err(|e| unusable(&e))?;
+        let world: World = toml::from_str(SCENARIO).map_err(|e| unusable(&e))?;
+        let mut description = world.simulation;
         description.truth.intrinsics = intrinsics;
         description.terrain.rocks.clear();
         description.terrain.scattered.count_n = 0;

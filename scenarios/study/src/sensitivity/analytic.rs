@@ -12,7 +12,7 @@ use super::{
     ANGLE_RAD, Bed, DETECTOR_PX, LENGTH_M, MATCH_PX, PER_CAMERA, Place, Seen, Source, TILT_RAD,
     WAYS, Way, failed, wrong_camera,
 };
-use crate::study::StudyError;
+use crate::StudyError;
 use nalgebra::{DMatrix, Matrix3x6, Matrix6, Matrix6xX, Point3, Vector2, Vector3};
 use rover_compensation::Compensation;
 

@@ -5,7 +5,7 @@ use super::{
     ANGLE_RAD, Bed, DETECTOR_PX, LENGTH_M, MATCH_PX, PER_CAMERA, Place, Seen, Source, TILT_RAD,
     WAYS, Way, failed, wrong_camera,
 };
-use crate::study::{StudyError, draws::Draws};
+use crate::{StudyError, draws::Draws};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector2, Vector3};
 use rover_cameras::{Camera, StereoPair};
 use rover_compensation::Compensation;

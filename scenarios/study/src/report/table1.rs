@@ -1,12 +1,10 @@
 //! Table 1 on page and terminal.
 
 use super::Shown;
-use crate::{
-    html::{
-        BLUE, GREEN, ORANGE,
-        plot::{Marks, Plot, Series},
-    },
-    study::table1::{Row, Table1},
+use crate::table1::{Row, Table1};
+use rover_page::{
+    BLUE, GREEN, ORANGE,
+    plot::{Marks, Plot, Series},
 };
 use std::fmt::Write;
 

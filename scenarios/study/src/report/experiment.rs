@@ -1,12 +1,10 @@
 //! The experiment on page and terminal.
 
 use super::Shown;
-use crate::{
-    html::{
-        BLUE, GREEN, ORANGE, PURPLE,
-        plot::{Marks, Plot, Series},
-    },
-    study::experiment::{Experiment, ExperimentPoint, Reference},
+use crate::experiment::{Experiment, ExperimentPoint, Reference};
+use rover_page::{
+    BLUE, GREEN, ORANGE, PURPLE,
+    plot::{Marks, Plot, Series},
 };
 use std::fmt::Write;
 

@@ -12,7 +12,7 @@ use super::{
     compare::Comparison, cost::Cost, experiment::Experiment, locality::Locality,
     sensitivity::Sensitivity, table1::Table1,
 };
-use crate::html::{document, escape};
+use rover_page::{document, escape};
 use serde::Serialize;
 use std::fmt::Write;
 

@@ -1,7 +1,7 @@
 //! Cost on page and terminal.
 
 use super::Shown;
-use crate::study::cost::Cost;
+use crate::cost::Cost;
 use std::fmt::Write;
 
 impl Shown for Cost {

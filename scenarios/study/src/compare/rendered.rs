@@ -2,7 +2,7 @@
 //! run it, without the time that motions take.
 
 use super::{Case, LOOKS, Outcome, Outcomes, START_M};
-use crate::study::{
+use crate::{
     StudyError,
     draws::{Draws, key},
     testbed::{Drawn, PAIR, Testbed},

@@ -1,7 +1,7 @@
 //! Pixels from the true geometry with noise; no images.
 
 use super::{Case, Failed, LOOKS, Outcome, Outcomes, START_M};
-use crate::study::{
+use crate::{
     StudyError,
     draws::Draws,
     workspace::{CAMERA_CENTRE_M, LEVELS},

@@ -1,12 +1,10 @@
 //! The comparison of methods on page and terminal.
 
 use super::{Shown, mm};
-use crate::{
-    html::{
-        BLUE, GREEN, ORANGE, PURPLE, escape,
-        plot::{Marks, Plot, Series},
-    },
-    study::compare::{Case, Cell, Comparison, OCCLUSIONS_CM},
+use crate::compare::{Case, Cell, Comparison, OCCLUSIONS_CM};
+use rover_page::{
+    BLUE, GREEN, ORANGE, PURPLE, escape,
+    plot::{Marks, Plot, Series},
 };
 use std::fmt::Write;
 

@@ -1,12 +1,10 @@
 //! Locality on page and terminal.
 
 use super::Shown;
-use crate::{
-    html::{
-        BLUE, GREEN, ORANGE,
-        plot::{Marks, Plot, Series},
-    },
-    study::locality::{Locality, LocalityPoint, Reference},
+use crate::locality::{Locality, LocalityPoint, Reference};
+use rover_page::{
+    BLUE, GREEN, ORANGE,
+    plot::{Marks, Plot, Series},
 };
 use std::fmt::Write;
 

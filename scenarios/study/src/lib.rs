@@ -12,10 +12,12 @@
 //! | [`sensitivity`] | how does each error source enter the final error |
 //! | [`compare`] | what do the other methods achieve |
 //! | [`cost`] | what does a cycle cost in time and memory |
+//! | [`detectors`] | how exactly are fiducials found and points matched, and how often falsely |
 
 pub mod batch;
 pub mod compare;
 pub mod cost;
+pub mod detectors;
 pub mod draws;
 pub mod experiment;
 pub mod locality;

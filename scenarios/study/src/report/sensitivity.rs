@@ -1,10 +1,8 @@
 //! Sensitivity on page and terminal.
 
 use super::Shown;
-use crate::{
-    html::{BLUE, GREEN, ORANGE, escape},
-    study::sensitivity::{ABOVE_M, Both, Row, Sensitivity},
-};
+use crate::sensitivity::{ABOVE_M, Both, Row, Sensitivity};
+use rover_page::{BLUE, GREEN, ORANGE, escape};
 use std::fmt::Write;
 
 /// The columns: heading and number.

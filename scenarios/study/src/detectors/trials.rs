@@ -51,13 +51,14 @@ type Blank = fn(&mut ChaCha8Rng, f64) -> bool;
 
 /// A detector or matcher.
 pub struct Subject {
+    /// Its name in the table.
     pub name: &'static str,
-    pub trial: Trial,
+    pub(super) trial: Trial,
     /// Whether something is accepted in a patch without the fiducial.
-    pub blank: Option<Blank>,
-    pub target: &'static str,
+    pub(super) blank: Option<Blank>,
+    pub(super) target: &'static str,
     /// Coordinates that the error has: 2, or 1 along the epipolar line.
-    pub coordinates: u32,
+    pub(super) coordinates: u32,
 }
 
 const FIDUCIAL: &str = "sigma < 0.02 px at 1 DN, < 0.05 px at 5 DN, no false accept";
