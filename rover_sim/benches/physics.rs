@@ -3,7 +3,10 @@
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use rover_kinematics::through;
-use rover_messages::arm::Guard;
+use rover_messages::{
+    arm::Guard,
+    mobility::{DriveArc, DriveGoal, DriveGuard},
+};
 use rover_robot::Robot;
 use rover_sim::{RockDescription, SimulationDescription, World};
 use std::sync::Arc;
@@ -54,5 +57,44 @@ fn steps(criterion: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, steps);
+/// The Rocky 8 on undulating ground with rocks, a metre forth and back.
+fn driving(criterion: &mut Criterion) {
+    const PERIODS: u32 = 10;
+    let text = include_str!("../../scenarios/robots/rocky8.toml");
+    let robot = Arc::new(Robot::parse(text, "rocky8.toml").unwrap());
+    let start = robot.posture("stow").unwrap().to_vec();
+    let mut description = SimulationDescription::default();
+    let terrain = &mut description.terrain;
+    terrain.rocks.clear();
+    terrain.centre_m = [2.0, 0.0];
+    terrain.size_m = [8.0, 6.0];
+    terrain.cell_m = 0.025;
+    terrain.relief_m = 0.02;
+    terrain.relief_wavelength_m = 2.0;
+    let mut world = World::new(robot, &description, 1, &start).unwrap();
+    let steps = u64::from(PERIODS) * world.steps_per_period();
+    let mut group = criterion.benchmark_group("control_steps");
+    group.throughput(Throughput::Elements(steps));
+    let mut forth = true;
+    group.bench_function("driving", |b| {
+        b.iter(|| {
+            if !world.is_moving() {
+                let goal = DriveGoal {
+                    arc: DriveArc::Arc {
+                        length_m: if forth { 1.0 } else { -1.0 },
+                        curvature_1_m: 0.0,
+                    },
+                    speed_fraction: 1.0,
+                    guard: DriveGuard::default(),
+                };
+                forth = !forth;
+                world.start_drive(&goal).unwrap();
+            }
+            world.advance(PERIODS)
+        });
+    });
+    group.finish();
+}
+
+criterion_group!(benches, steps, driving);
 criterion_main!(benches);

@@ -20,8 +20,9 @@ use rover_messages::{
     simulation::{
         DesignateRequest, InjectedFault, PickRequest, ScoreRequest, StepRequest, ViewRequest,
     },
+    status::work,
 };
-use rover_service::{Service, ServiceShell, Starting};
+use rover_service::{Service, ServiceShell};
 use std::{
     sync::{Arc, Mutex},
     time::Duration,
@@ -105,11 +106,7 @@ impl Pace {
 ///
 /// # Errors
 /// [`BusError`] when a key cannot be declared or the hardware is present already.
-pub fn serve(peer: &Peer, world: World, options: Options) -> Starting<'_, Hardware> {
-    Box::pin(start(peer, world, options))
-}
-
-async fn start(peer: &Peer, world: World, options: Options) -> Result<Hardware, BusError> {
+pub async fn serve(peer: &Peer, world: World, options: Options) -> Result<Hardware, BusError> {
     let robot = world.robot().clone();
     let shell = ServiceShell::new(peer, &robot, HARDWARE).await?;
     let states = Arc::new(peer.stream(keys::ARM_STATE).await?);
@@ -167,7 +164,9 @@ async fn start(peer: &Peer, world: World, options: Options) -> Result<Hardware, 
         let name = pair.name.clone();
         let grab = move |hands: &Hands, request: CaptureRequest| {
             let (eyes, moment) = hands.look();
-            lock(&eyes).grab(&moment, &name, request.exposure_n)
+            hands.shell.timed(work::RENDERING, || {
+                lock(&eyes).grab(&moment, &name, request.exposure_n)
+            })
         };
         served.push(
             hands
@@ -232,7 +231,9 @@ async fn simulation_keys(peer: &Peer, hands: &Hands) -> Result<Vec<rover_bus::Se
                 "views",
                 |hands, request: ViewRequest| {
                     let (eyes, moment) = hands.look();
-                    lock(&eyes).view(&moment, &request)
+                    hands
+                        .shell
+                        .timed(work::RENDERING, || lock(&eyes).view(&moment, &request))
                 },
             )
             .await?,
@@ -325,7 +326,7 @@ impl Hands {
     fn grant(&self) -> Advance {
         let mut world = lock(&self.world);
         let before = world.collision();
-        let advance = world.advance(1);
+        let advance = self.shell.timed(work::PHYSICS, || world.advance(1));
         let collision = world.collision().filter(|_| before.is_none());
         drop(world);
         if let Some(c) = collision {

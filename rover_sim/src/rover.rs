@@ -26,10 +26,13 @@ use rover_messages::mobility::{DriveGoal, DriveResult, DriveStop, WheelsState};
 use rover_robot::{MobilityDescription, VehicleDynamics};
 use soil::Soil;
 
-/// Control steps between two looks at loads, slip and odometry.
-const TICK_STEPS: u64 = 10;
-/// Consecutive steps below the rest speeds that count as rest.
-const REST_STEPS: u32 = 25;
+/// Steps of the world in one step of the driving rover. What is stiff in it (drives, suspension,
+/// contacts) is implicit or far slower than this, and it drives at a tenth of a metre per second.
+const WORLD_STEPS: u64 = 2;
+/// Its steps between two looks at loads, slip and odometry.
+const TICK_STEPS: u64 = 5;
+/// Its consecutive steps below the rest speeds that count as rest.
+const REST_STEPS: u32 = 13;
 const REST_M_S: f64 = 2e-4;
 const REST_RAD_S: f64 = 1e-3;
 /// Longest wait for rest, s.
@@ -43,7 +46,7 @@ pub(crate) struct Vehicle {
     soil: Soil,
     odometry: Odometry,
     world_from_site: Isometry3<f64>,
-    step_s: f64,
+    world_step_s: f64,
     weight_n: f64,
     goal: Option<DriveGoal>,
     pending: Increment,
@@ -77,17 +80,18 @@ impl Vehicle {
     ) -> Result<Self, SimulationError> {
         let start = d.rover.unwrap_or_default();
         let world_from_rover = above_ground(parts.mobility, terrain, &start);
+        let step_s = d.step_s * WORLD_STEPS as f64;
         let mut physics = RoverPhysics::new(
             parts.mobility,
             parts.dynamics,
             &parts.arm,
             &parts.gravity_m_s2,
-            d.step_s,
+            step_s,
             terrain,
             &world_from_rover,
         )?;
-        let mut drive = Drive::new(parts.mobility, d.step_s);
-        settle(&mut physics, &mut drive, d.step_s)?;
+        let mut drive = Drive::new(parts.mobility, step_s);
+        settle(&mut physics, &mut drive, step_s)?;
         let soil = d.terrain.soil.clone().unwrap_or_default();
         let scale = d.truth.mobility_scale.unwrap_or(1.0);
         let standing = physics.world_from_rover();
@@ -103,7 +107,7 @@ impl Vehicle {
             soil: Soil::new(soil, seed),
             odometry: Odometry::new(parts.mobility.odometry, scale, seed, &standing),
             world_from_site: levelled(&standing),
-            step_s: d.step_s,
+            world_step_s: d.step_s,
             weight_n: mass_kg * parts.gravity_m_s2.norm(),
             goal: None,
             pending: Increment::default(),
@@ -134,8 +138,11 @@ impl Vehicle {
         self.drive.stop(reason);
     }
 
-    /// One control step; `step` is its number. The outcome when the drive has ended.
+    /// One step of the world; `step` is its number. The outcome when the drive has ended.
     pub fn advance(&mut self, step: u64) -> Option<Result<DriveResult, DriveStop>> {
+        if !step.is_multiple_of(WORLD_STEPS) {
+            return None;
+        }
         let increment = self.drive.advance();
         self.pending.way_m += increment.way_m;
         self.pending.turn_rad += increment.turn_rad;
@@ -161,7 +168,7 @@ impl Vehicle {
         } else {
             0
         };
-        let waited_s = self.settling_steps as f64 * self.step_s;
+        let waited_s = (self.settling_steps * WORLD_STEPS) as f64 * self.world_step_s;
         if self.calm_steps < REST_STEPS && waited_s < SETTLE_LIMIT_S {
             return None;
         }
@@ -232,7 +239,7 @@ impl Vehicle {
     pub fn state_at(&self, world_from_rover: &Isometry3<f64>, step: u64) -> WheelsState {
         let covariance = self.odometry.covariance();
         WheelsState {
-            sim_time_s: step as f64 * self.step_s,
+            sim_time_s: step as f64 * self.world_step_s,
             step,
             pose: self.odometry.pose(world_from_rover, step),
             covariance: [0, 1, 2].map(|i| [0, 1, 2].map(|j| covariance[(i, j)])),
@@ -252,7 +259,7 @@ impl Vehicle {
     /// How far the rover moves while its drives hold, m.
     pub fn creep_m(&mut self, steps: u32) -> f64 {
         let before = self.world_from_rover().translation.vector;
-        for _ in 0..steps {
+        for _ in 0..steps / WORLD_STEPS as u32 {
             self.physics.command(
                 &self.drive.steer_rad,
                 &[0.0; 4],

@@ -48,7 +48,8 @@ pub fn page(
     body += &images(evidence)?;
     body += &approach::approach(report, evidence)?;
     body += &servo(report, evidence);
-    body += &section("Timeline", &timeline::timeline(&report.phases));
+    let kinds = timeline::kinds(&report.wall_by_kind_s);
+    body += &section("Timeline", &(timeline::timeline(&report.phases) + &kinds));
     body += &section("Measured against the truth", &truth(report, evidence));
     let toml = escape(&scenario.to_toml()?);
     body += &section(

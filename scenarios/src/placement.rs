@@ -27,10 +27,14 @@ use rover_messages::{
     placement::{ContactFeedback, ContactResult, PlaceFeedback, PlaceResult},
     planning::{Plan, PlanGoal, PlanRequest, SurveyReport, SurveyRequest},
     simulation::{Score, ScoreRequest, TruthState},
+    status::{ServiceStatus, work},
     target::Target,
 };
 use rover_robot::Robot;
-use std::time::{Duration, Instant};
+use std::{
+    collections::BTreeMap,
+    time::{Duration, Instant},
+};
 
 /// Name under which the runner announces itself and commands.
 pub const RUNNER: &str = "runner";
@@ -67,6 +71,7 @@ pub struct Mission<'a> {
     abort: Abort,
     observer: &'a mut dyn Observer,
     sim_time_s: f64,
+    since: Instant,
     phases: Vec<Phase>,
     evidence: Option<Evidence>,
 }
@@ -102,6 +107,7 @@ impl<'a> Mission<'a> {
             abort,
             observer,
             sim_time_s: 0.0,
+            since: Instant::now(),
             phases,
             evidence,
         }
@@ -134,7 +140,8 @@ impl<'a> Mission<'a> {
                 self.stop().await;
             }
         }
-        let report = self.report(&record, ended.err());
+        let mut report = self.report(&record, ended.err());
+        report.wall_by_kind_s = self.wall_by_kind_s().await;
         if let Some(evidence) = &mut self.evidence {
             evidence.target = record.target;
             evidence.score = record.score;
@@ -339,6 +346,28 @@ impl<'a> Mission<'a> {
         outcome
     }
 
+    /// What simulator and services say of their computing, and what is left of the wall time.
+    async fn wall_by_kind_s(&self) -> BTreeMap<String, f64> {
+        let mut by_kind = BTreeMap::<String, f64>::new();
+        let driven = [keys::service::HARDWARE, keys::service::ROVER_APPROACH];
+        for service in keys::service::ALL.into_iter().chain(driven) {
+            if !self.peer.is_present(service).await.unwrap_or(false) {
+                continue;
+            }
+            let limit = self.scenario.limits.question();
+            let key = keys::status(service);
+            if let Ok(status) = self.peer.latest::<ServiceStatus>(&key, limit).await {
+                for (kind, busy_s) in status.busy_s {
+                    *by_kind.entry(kind).or_default() += busy_s;
+                }
+            }
+        }
+        let wall_s = self.since.elapsed().as_secs_f64();
+        let known_s: f64 = by_kind.values().sum();
+        by_kind.insert(work::BUS.into(), (wall_s - known_s).max(0.0));
+        by_kind
+    }
+
     /// Simulated time, s.
     async fn now_s(&self) -> Result<f64, BusError> {
         let limit = self.scenario.limits.question();
@@ -373,6 +402,7 @@ impl<'a> Mission<'a> {
                 .score
                 .as_ref()
                 .map(|score| TruthReport::new(score, &record.waypoints)),
+            wall_by_kind_s: BTreeMap::new(),
             digest: String::new(),
         }
     }

@@ -16,6 +16,7 @@ use rover_messages::{
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
 
 /// Why a report cannot be written.
 #[derive(Debug, thiserror::Error)]
@@ -64,6 +65,10 @@ pub struct RunReport {
     pub contact: Option<ContactReport>,
     /// The placement measured by the simulator against its own geometry.
     pub truth: Option<TruthReport>,
+    /// Wall time by kind of computing ([`rover_messages::status::work`]), summed over simulator
+    /// and services, s; `bus` is what is left of the wall time.
+    #[serde(default)]
+    pub wall_by_kind_s: BTreeMap<String, f64>,
     /// SHA-256 over everything but wall times, hexadecimal.
     pub digest: String,
 }
@@ -313,6 +318,14 @@ impl RunReport {
         }
         let (sim, wall) = self.times();
         line("time", format!("{sim:.1} s simulated in {wall:.1} s"));
+        if !self.wall_by_kind_s.is_empty() {
+            let kinds: Vec<String> = self
+                .wall_by_kind_s
+                .iter()
+                .map(|(kind, s)| format!("{kind} {s:.1}"))
+                .collect();
+            line("of this, s", kinds.join(", "));
+        }
         line("digest", self.digest.clone());
         lines.join("\n") + "\n"
     }
@@ -331,6 +344,7 @@ fn strip(report: &mut Value) {
         return;
     };
     fields.remove("digest");
+    fields.remove("wall_by_kind_s");
     if let Some(Value::Array(phases)) = fields.get_mut("phases") {
         for phase in phases {
             if let Value::Object(phase) = phase {

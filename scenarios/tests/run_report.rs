@@ -53,6 +53,7 @@ fn report() -> RunReport {
             arm_model_error_mm: 17.1,
             sources: ErrorSources::default(),
         }),
+        wall_by_kind_s: Default::default(),
         digest: String::new(),
     }
     .sealed()

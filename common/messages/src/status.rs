@@ -16,6 +16,9 @@ pub struct ServiceStatus {
     pub last_fault: Option<Fault>,
     /// What it has counted since its start.
     pub counters: BTreeMap<String, u64>,
+    /// Wall time that it has computed since its start, by kind (see [`work`]), s. It says where
+    /// time goes and nothing of what was done.
+    pub busy_s: BTreeMap<String, f64>,
     /// SHA-256 of the effective robot description.
     pub configuration_sha256: String,
     /// Version of the build.
@@ -32,4 +35,18 @@ pub struct FaultReport {
     pub action: String,
 }
 
-wire! { ServiceStatus = "service_status/1", FaultReport = "fault_report/1" }
+/// Kinds of computing.
+pub mod work {
+    /// Steps of the simulated world.
+    pub const PHYSICS: &str = "physics";
+    /// Pictures of the simulated world.
+    pub const RENDERING: &str = "rendering";
+    /// Finding, matching, tracking in images.
+    pub const VISION: &str = "vision";
+    /// Ways of arm and rover.
+    pub const PLANNING: &str = "planning";
+    /// What is left of a run's wall time: messages on their way, waiting, bookkeeping.
+    pub const BUS: &str = "bus";
+}
+
+wire! { ServiceStatus = "service_status/2", FaultReport = "fault_report/1" }

@@ -21,16 +21,12 @@ use rover_messages::{
 use rover_robot::Robot;
 use std::{
     fmt,
-    pin::Pin,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::Instant,
 };
 
 /// State of a service that waits for something to do.
 pub const READY: &str = "ready";
-
-/// A service that comes up. Boxed, so that it is compiled where it is written and not where it is
-/// started.
-pub type Starting<'a, T> = Pin<Box<dyn Future<Output = Result<T, BusError>> + Send + 'a>>;
 
 /// Bookkeeping of one service: what it does, what it has counted, its last fault. Cheap to clone;
 /// all clones are the same service. Every change is published on `<service>/status`.
@@ -72,6 +68,7 @@ impl ServiceShell {
             state: READY.into(),
             last_fault: None,
             counters: Default::default(),
+            busy_s: Default::default(),
             configuration_sha256: robot.configuration_sha256().into(),
             version: env!("CARGO_PKG_VERSION").into(),
         };
@@ -129,6 +126,16 @@ impl ServiceShell {
     /// Adds one to a counter.
     pub fn count(&self, counter: &str) {
         self.change(|s| *s.counters.entry(counter.into()).or_default() += 1);
+    }
+
+    /// Computes, and counts the wall time of it under a kind of
+    /// [`work`](rover_messages::status::work). The status that tells it is the next one published.
+    pub fn timed<T>(&self, work: &str, compute: impl FnOnce() -> T) -> T {
+        let since = Instant::now();
+        let computed = compute();
+        let busy_s = since.elapsed().as_secs_f64();
+        *self.lock().busy_s.entry(work.into()).or_default() += busy_s;
+        computed
     }
 
     /// Reports a fault on `fault/<service>` with what was done about it (`goal refused`, `arm

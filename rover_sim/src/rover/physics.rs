@@ -110,7 +110,7 @@ impl RoverPhysics {
         p.static_contact_softness = softness;
         p.max_ccd_substeps = 0;
         // More than twice the speed at which the solver sees only the triangles underneath.
-        p.normalized_prediction_distance = 0.002;
+        p.normalized_prediction_distance = 0.0005;
         let statics = terrain_colliders(terrain, dynamics.friction)?
             .into_iter()
             .map(|c| c.map(|c| world.insert_collider(c, None)))

@@ -10,6 +10,7 @@ use rover_messages::{
     keys::service::HARDWARE,
     simulation::{Pick, PickRequest, SurfaceKind, TruePlace},
 };
+use std::f64::consts::FRAC_PI_4;
 
 /// Largest angle between a picked surface's normal and the direction towards the camera, rad.
 const FACING_RAD: f64 = 1.0;
@@ -86,7 +87,7 @@ impl World {
     /// # Errors
     /// Fault `no_place` with the number of places tried.
     pub fn pick(&self, request: &PickRequest) -> Result<Pick, Fault> {
-        const TRIES: u32 = 2000;
+        const TRIES: u32 = 4000;
         let world_from_rover = self.world_from_rover().unwrap_or_else(Isometry3::identity);
         let eye = self.lookout(&world_from_rover);
         let mut random = ChaCha8Rng::seed_from_u64(self.origin.0);
@@ -174,19 +175,22 @@ impl World {
     /// Whether what surrounds a surface point, as seen from `eye`, is the same surface: nobody
     /// names a target on an edge.
     fn is_plain(&self, eye: &Vector3<f64>, place: &SurfacePoint) -> bool {
-        /// Distance of what must be alike, m.
-        const AROUND_M: f64 = 0.03;
+        /// Distance of what must be alike: m, and rad as seen from the eye (ten pixels of a mast
+        /// camera).
+        const AROUND: (f64, f64) = (0.03, 0.008);
         /// Largest step in range, m, and largest angle between the normals, rad.
         const STEP_M: f64 = 0.10;
         const BEND_RAD: f64 = 0.7;
         let along = place.point_m - eye;
         let (range_m, along) = (along.norm(), along.normalize());
+        let around_m = AROUND.0.max(AROUND.1 * range_m);
         let aside = along.cross(&Vector3::z()).normalize();
         let up = aside.cross(&along);
-        [aside, -aside, up, -up].iter().all(|way| {
-            let towards = (along * range_m + way * AROUND_M).normalize();
+        (0..8).map(|i| f64::from(i) * FRAC_PI_4).all(|angle| {
+            let way = aside * angle.cos() + up * angle.sin();
+            let towards = (along * range_m + way * around_m).normalize();
             lock(&self.eyes).first_on(eye, &towards).is_some_and(|at| {
-                let flat_m = STEP_M + AROUND_M / along.dot(&place.normal).abs().max(0.05);
+                let flat_m = STEP_M + around_m / along.dot(&place.normal).abs().max(0.05);
                 at.body_n == place.body_n
                     && ((at.point_m - eye).norm() - range_m).abs() < flat_m
                     && at.normal.angle(&place.normal) < BEND_RAD

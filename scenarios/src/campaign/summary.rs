@@ -307,6 +307,7 @@ mod tests {
             servo: None,
             contact: None,
             truth: None,
+            wall_by_kind_s: BTreeMap::new(),
             digest: String::new(),
         }
     }

@@ -2,7 +2,7 @@
 
 use crate::report::Phase;
 use rover_page::escape;
-use std::fmt::Write;
+use std::{collections::BTreeMap, fmt::Write};
 
 const WIDTH: f64 = 960.0;
 const LEFT: f64 = 110.0;
@@ -62,6 +62,25 @@ pub(super) fn timeline(phases: &[Phase]) -> String {
         start += phase.sim_s;
     }
     out + "</svg>"
+}
+
+/// Where the wall time went, in words.
+pub(super) fn kinds(wall_by_kind_s: &BTreeMap<String, f64>) -> String {
+    let total_s: f64 = wall_by_kind_s.values().sum();
+    if total_s <= 0.0 {
+        return String::new();
+    }
+    let kinds: Vec<String> = wall_by_kind_s
+        .iter()
+        .map(|(kind, s)| {
+            let percent = 100.0 * s / total_s;
+            format!("{} {s:.1} s ({percent:.0} %)", escape(kind))
+        })
+        .collect();
+    format!(
+        "<p>Wall time by kind of computing: {}. The bus has what the others leave.</p>",
+        kinds.join(", ")
+    )
 }
 
 fn nice_step(total_s: f64) -> f64 {

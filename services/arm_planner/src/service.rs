@@ -8,9 +8,10 @@ use rover_messages::{
     imaging::StereoFrame,
     keys,
     planning::{Plan, PlanRequest, SurveyReport, SurveyRequest},
+    status::work,
 };
 use rover_robot::{CameraPairDescription, Robot};
-use rover_service::{Service, ServiceShell, Starting, frames};
+use rover_service::{Service, ServiceShell, frames};
 use rover_vision::{MatchRules, sparse_points};
 use std::{
     sync::{Arc, Mutex, PoisonError},
@@ -26,11 +27,7 @@ const SURVEY_STEP_PX: u32 = 10;
 ///
 /// # Errors
 /// [`BusError`] when a key cannot be declared or the name is taken.
-pub fn serve(peer: &Peer, robot: Arc<Robot>) -> Starting<'_, Service> {
-    Box::pin(start(peer, robot))
-}
-
-async fn start(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
+pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
     let shell = ServiceShell::new(peer, &robot, SERVICE).await?;
     let desk = Desk {
         peer: peer.clone(),
@@ -74,7 +71,8 @@ impl Desk {
             None => self.joints().await?,
         };
         let planner = self.planner();
-        aside(move || planner.plan(&request, &joints)).await
+        let shell = self.shell.clone();
+        aside(move || shell.timed(work::PLANNING, || planner.plan(&request, &joints))).await
     }
 
     async fn survey(&self, request: SurveyRequest) -> Result<SurveyReport, Fault> {
@@ -90,8 +88,10 @@ impl Desk {
             .clone();
         let joints = self.joints().await?;
         let frame = frames::capture(&self.peer, SERVICE, &pair.name).await?;
-        let planner = self.planner();
-        let planner = aside(move || mapped(planner, &frame, &pair, &joints)).await?;
+        let (planner, shell) = (self.planner(), self.shell.clone());
+        let planner =
+            aside(move || shell.timed(work::VISION, || mapped(planner, &frame, &pair, &joints)))
+                .await?;
         let report = planner.terrain().map(|map| SurveyReport {
             points_n: map.points_n() as u32,
             cells_n: map.cells_n() as u32,

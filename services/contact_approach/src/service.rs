@@ -10,18 +10,14 @@ use rover_messages::{
     planning::PlanRequest,
 };
 use rover_robot::Robot;
-use rover_service::{Service, ServiceShell, Starting, motion::ArmClient};
+use rover_service::{Service, ServiceShell, motion::ArmClient};
 use std::{sync::Arc, time::Duration};
 
 /// Starts the service on `peer`; it lives as long as the returned value.
 ///
 /// # Errors
 /// [`BusError`] when a key cannot be declared or the name is taken.
-pub fn serve(peer: &Peer, robot: Arc<Robot>) -> Starting<'_, Service> {
-    Box::pin(start(peer, robot))
-}
-
-async fn start(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
+pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
     let shell = ServiceShell::new(peer, &robot, CONTACT_APPROACH).await?;
     let contact = Contact {
         arm: ArmClient::new(peer, CONTACT_APPROACH),

@@ -14,10 +14,11 @@ use rover_messages::{
         service::{ARM_PLANNER, EPEC_SERVO},
     },
     placement::{Look, PlaceFeedback, PlaceGoal, PlaceResult},
+    status::work,
 };
 use rover_robot::Robot;
 use rover_service::{
-    Service, ServiceShell, Starting,
+    Service, ServiceShell,
     motion::{ArmClient, interrupted},
 };
 use std::{sync::Arc, time::Duration};
@@ -29,11 +30,7 @@ const FRAME_LIMIT: Duration = Duration::from_secs(60);
 ///
 /// # Errors
 /// [`BusError`] when a key cannot be declared or the name is taken.
-pub fn serve(peer: &Peer, robot: Arc<Robot>) -> Starting<'_, Service> {
-    Box::pin(start(peer, robot))
-}
-
-async fn start(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
+pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
     let shell = ServiceShell::new(peer, &robot, EPEC_SERVO).await?;
     let servo = Servo {
         arm: ArmClient::new(peer, EPEC_SERVO),
@@ -124,7 +121,10 @@ impl Servo {
                             BusError::Fault(fault) => fault,
                             other => Fault::new(EPEC_SERVO, "imaging_silent", other.to_string()),
                         })?;
-                    let look = tokio::task::block_in_place(|| placement.look(&q, &frame))?;
+                    let look = tokio::task::block_in_place(|| {
+                        self.shell
+                            .timed(work::VISION, || placement.look(&q, &frame))
+                    })?;
                     self.shell.count(if look.found {
                         "fiducials_found"
                     } else {

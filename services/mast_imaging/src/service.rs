@@ -9,7 +9,7 @@ use rover_messages::{
     keys,
 };
 use rover_robot::{CameraPairDescription, Robot};
-use rover_service::{Service, ServiceShell, Starting};
+use rover_service::{Service, ServiceShell};
 use rover_vision::{Image8, encode_png};
 use std::{
     collections::VecDeque,
@@ -27,11 +27,7 @@ const KEPT_FRAMES: usize = 8;
 ///
 /// # Errors
 /// [`BusError`] when a key cannot be declared or the name is taken.
-pub fn serve(peer: &Peer, robot: Arc<Robot>) -> Starting<'_, Service> {
-    Box::pin(start(peer, robot))
-}
-
-async fn start(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
+pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
     let shell = ServiceShell::new(peer, &robot, SERVICE).await?;
     let mut served = Vec::new();
     for pair in &robot.description().cameras {

@@ -142,6 +142,27 @@ impl Template {
         })
     }
 
+    /// Its weights, row by row; they sum to one.
+    #[must_use]
+    pub fn weights(&self) -> &[f64] {
+        &self.weights
+    }
+
+    /// The same with only some of its pixels counting.
+    #[must_use]
+    pub fn masked(&self, counts: &[bool]) -> Self {
+        let left = |(w, counts): (&f64, &bool)| if *counts { *w } else { 0.0 };
+        let raw: Vec<f64> = self.weights.iter().zip(counts).map(left).collect();
+        let sum: f64 = raw.iter().sum::<f64>().max(1e-12);
+        let weights: Vec<f64> = raw.iter().map(|w| w / sum).collect();
+        Self {
+            half: self.half,
+            normal: normalised(&self.patch, &weights),
+            patch: self.patch.clone(),
+            weights,
+        }
+    }
+
     /// Weighted standard deviation of its grey values, DN.
     #[must_use]
     pub fn deviation_dn(&self) -> f64 {

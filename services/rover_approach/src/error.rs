@@ -90,6 +90,17 @@ pub enum TrackError {
         /// Limit, px.
         limit_px: f64,
     },
+    /// A part of the rover is in the line of sight.
+    #[error("the rover's own body is between the camera and the target")]
+    Hidden,
+    /// The edge of the rover's own shadow lies on the template.
+    #[error("the rover's own shadow leaves {:.0} % of the template, need {:.0} %", part * 100.0, limit * 100.0)]
+    OwnShadow {
+        /// Part of the template's weight that is lit alike in both pictures.
+        part: f64,
+        /// Least part.
+        limit: f64,
+    },
     /// The target's window holds something that one plane cannot describe.
     #[error("the surface about the target is no plane: correlation {score:.3}, need {limit}")]
     NotPlanar {

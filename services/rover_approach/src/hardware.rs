@@ -1,6 +1,9 @@
 //! Mast, wheels and cameras on behalf of the approach: goals with heartbeats, frames by name.
 
+use crate::own_shadow::OwnShadow;
+use crate::shade::Shade;
 use crate::view::View;
+use nalgebra::Vector3;
 use rover_bus::{BusError, GoalContext, Peer};
 use rover_messages::{
     Fault, Wire,
@@ -12,9 +15,10 @@ use rover_messages::{
         DriveArc, DriveFeedback, DriveGoal, DriveGuard, DriveResult, PointFeedback, PointGoal,
         PointResult,
     },
+    status::work,
     target::{SelectRequest, Target},
 };
-use rover_service::{frames::prepared, motion::interrupted};
+use rover_service::{ServiceShell, frames::prepared, motion::interrupted};
 use std::{sync::Arc, time::Duration};
 
 /// Wall-clock limit for one answer.
@@ -29,6 +33,17 @@ pub(crate) fn fault(name: &str, message: impl Into<String>) -> Fault {
 pub(crate) struct Hardware<'a> {
     pub peer: &'a Peer,
     pub context: &'a GoalContext<DriveToFeedback>,
+    /// What casts the rover's own shadow, if the sun is known.
+    pub light: Option<Light>,
+    /// Counts the time that computing takes.
+    pub shell: &'a ServiceShell,
+}
+
+/// The sun and what of the rover is in its way.
+pub(crate) struct Light {
+    pub shade: Arc<Shade>,
+    /// Unit vector towards the sun, site frame.
+    pub sun_in_site: Vector3<f64>,
 }
 
 /// A frame ready for matching.
@@ -70,7 +85,8 @@ impl Hardware<'_> {
             .ask(&keys::imaging_capture(pair), &request, ANSWER_LIMIT)
             .await
             .map_err(|e| e.into_fault(ROVER_APPROACH))?;
-        ready(frame, exposure_n)
+        self.shell
+            .timed(work::VISION, || self.ready(frame, exposure_n))
     }
 
     /// Where the arm is, rad.
@@ -94,7 +110,7 @@ impl Hardware<'_> {
             )
             .await
             .map_err(|e| e.into_fault(ROVER_APPROACH))?;
-        ready(frame, reference.exposure_n)
+        self.ready(frame, reference.exposure_n)
     }
 
     /// The target at a pixel, with normal, roughness and covariance.
@@ -107,6 +123,30 @@ impl Hardware<'_> {
             .ask(keys::TARGET_SELECT, &request, ANSWER_LIMIT)
             .await
             .map_err(|e| e.into_fault(ROVER_APPROACH))
+    }
+
+    fn ready(&self, frame: StereoFrame, exposure_n: u32) -> Result<Frame, Fault> {
+        let (left, right) = prepared(ROVER_APPROACH, &frame)?;
+        let view = View::new(left, right, frame.cameras.clone())
+            .map_err(|e| fault("bad_frame", e.to_string()))?
+            .shadowed(self.own_shadow(&frame));
+        Ok(Frame {
+            view: Arc::new(view),
+            reference: FrameReference {
+                pair: frame.images.pair.clone(),
+                step: frame.images.step,
+                exposure_n,
+            },
+            frame: Arc::new(frame),
+        })
+    }
+
+    fn own_shadow(&self, frame: &StereoFrame) -> Option<OwnShadow> {
+        let light = self.light.as_ref()?;
+        let pose = &frame.images.wheels.as_ref()?.pose;
+        let rover_from_site = pose.site_from_rover().isometry.inverse();
+        let sun = rover_from_site.rotation * light.sun_in_site;
+        Some(OwnShadow::new(Arc::clone(&light.shade), sun))
     }
 
     /// Carries out a lockstep action; every heartbeat comes from this loop. An interruption of our
@@ -148,19 +188,4 @@ impl Hardware<'_> {
             }
         }
     }
-}
-
-fn ready(frame: StereoFrame, exposure_n: u32) -> Result<Frame, Fault> {
-    let (left, right) = prepared(ROVER_APPROACH, &frame)?;
-    let view = View::new(left, right, frame.cameras.clone())
-        .map_err(|e| fault("bad_frame", e.to_string()))?;
-    Ok(Frame {
-        view: Arc::new(view),
-        reference: FrameReference {
-            pair: frame.images.pair.clone(),
-            step: frame.images.step,
-            exposure_n,
-        },
-        frame: Arc::new(frame),
-    })
 }

@@ -20,6 +20,7 @@ pub mod handover;
 #[cfg(feature = "bus")]
 mod hardware;
 pub mod obstacles;
+pub mod own_shadow;
 pub mod patch;
 pub mod relief;
 #[cfg(feature = "bus")]

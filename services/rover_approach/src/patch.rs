@@ -30,6 +30,12 @@ impl HalfSize {
         2 * self.u + 1
     }
 
+    /// The window's offsets from its middle, px, row by row.
+    pub fn offsets(self) -> impl Iterator<Item = Vector2<f64>> {
+        let (hu, hv) = (self.u as i64, self.v as i64);
+        (-hv..=hv).flat_map(move |v| (-hu..=hu).map(move |u| Vector2::new(u as f64, v as f64)))
+    }
+
     /// Rows.
     #[must_use]
     pub fn rows(self) -> usize {

@@ -9,18 +9,14 @@ use rover_messages::{
     keys::{self, service::ROVER_APPROACH},
 };
 use rover_robot::Robot;
-use rover_service::{Service, ServiceShell, Starting};
+use rover_service::{Service, ServiceShell};
 use std::{sync::Arc, time::Duration};
 
 /// Starts the service on `peer`; it lives as long as the returned value.
 ///
 /// # Errors
 /// [`BusError`] when a key cannot be declared or the name is taken.
-pub fn serve(peer: &Peer, robot: Arc<Robot>) -> Starting<'_, Service> {
-    Box::pin(start(peer, robot))
-}
-
-async fn start(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
+pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
     let shell = ServiceShell::new(peer, &robot, ROVER_APPROACH).await?;
     let approach = Approach {
         peer: peer.clone(),
@@ -57,6 +53,8 @@ impl Approach {
         let hardware = Hardware {
             peer: &self.peer,
             context,
+            light: None,
+            shell: &self.shell,
         };
         match Session::run(hardware, &self.robot, &goal).await {
             Ok(result) => {

@@ -7,7 +7,7 @@ use crate::drive::{DriveRules, next_movement};
 use crate::filter::{Motion, TargetEstimate};
 use crate::first_ray::{FirstRayRules, first_ray};
 use crate::handover::{HandoverRules, hand_over};
-use crate::hardware::{Frame, Hardware, fault};
+use crate::hardware::{Frame, Hardware, Light, fault};
 use crate::obstacles::{GroundMap, GroundRules, PlanarPose};
 use crate::report::{Budget, sighting, sigma_mm};
 use crate::service::unfit;
@@ -23,6 +23,7 @@ use rover_messages::{
         Sighting,
     },
     mobility::{DriveArc, DriveResult, WheelsState},
+    status::work,
     target::Target,
 };
 use rover_robot::{MastDescription, MobilityDescription, Robot};
@@ -41,12 +42,16 @@ const MAP_STEP_PX: u32 = 16;
 const OWN_M: f64 = 0.08;
 /// Frames whose points are kept.
 const MAP_FRAMES: usize = 6;
+/// A part of the rover that comes so near to the line of sight hides the target, m.
+const HIDING_M: f64 = 0.01;
 /// Most stops if the goal does not say.
 const MAX_STOPS_N: u32 = 60;
 /// Base poses that may be chosen anew after a look of the body cameras.
-const SECOND_CHOICES_N: u32 = 2;
+const SECOND_CHOICES_N: u32 = 4;
 /// Stops in a row at which the target may be missed.
 const MISSES_N: u32 = 1;
+/// The same while the rover's own body or the edge of its shadow passes over it.
+const SHADED_MISSES_N: u32 = 5;
 /// Largest uncertainty with which a missed target is carried on by odometry, mm, one sigma.
 const MISSED_SIGMA_MM: f64 = 120.0;
 
@@ -68,7 +73,7 @@ pub(crate) struct Session<'a> {
     driven_m: f64,
     spot_offset_m: Option<Vector3<f64>>,
     near_moves_n: u32,
-    shade: Shade,
+    shade: Arc<Shade>,
     /// Stops in a row at which the target was not found.
     missed_n: u32,
     /// The base pose that is driven to, site frame.
@@ -89,24 +94,30 @@ enum Finish {
 impl<'a> Session<'a> {
     /// Drives to the goal's target.
     pub async fn run(
-        hardware: Hardware<'a>,
+        mut hardware: Hardware<'a>,
         robot: &'a Robot,
         goal: &'a DriveToGoal,
     ) -> Result<DriveToResult, Fault> {
         let mobility = robot.mobility().map_err(|e| unfit(&e))?;
         let mast = robot.mast().map_err(|e| unfit(&e))?;
         let pair = robot.pair(&goal.target.pair).map_err(|e| unfit(&e))?;
+        let stowed_rad = hardware.joints_rad().await?;
+        let shade = Arc::new(Shade::of(robot, &stowed_rad));
+        hardware.light = sun_of(goal).map(|sun_in_site| Light {
+            shade: Arc::clone(&shade),
+            sun_in_site,
+        });
         let now = hardware.recall(&goal.anchor).await?;
         let wheels = wheels_of(&now)?;
-        let stowed_rad = hardware.joints_rad().await?;
         let pixel = Vector2::from(goal.target.pixel_px);
-        let tracker = Tracker::designate(
-            Arc::clone(&now.view),
-            pixel,
-            [pair.range_min_m, 1.5 * pair.range_max_m],
-            TrackRules::default(),
-        )
-        .map_err(|e| fault("target_not_trackable", e.to_string()))?;
+        let range_m = [pair.range_min_m, 1.5 * pair.range_max_m];
+        let view = Arc::clone(&now.view);
+        let tracker = hardware
+            .shell
+            .timed(work::VISION, || {
+                Tracker::designate(view, pixel, range_m, TrackRules::default())
+            })
+            .map_err(|e| fault("target_not_trackable", e.to_string()))?;
         let (_, surface) = tracker.target();
         let estimate = TargetEstimate::new(surface.plane.point, surface.covariance_m2)
             .map_err(|e| fault("target_not_trackable", e.to_string()))?;
@@ -135,7 +146,7 @@ impl<'a> Session<'a> {
             driven_m: 0.0,
             spot_offset_m: None,
             near_moves_n: 0,
-            shade: Shade::of(robot, &stowed_rad),
+            shade,
             missed_n: 0,
             aim: None,
             normal_in_site: None,
@@ -151,9 +162,11 @@ impl<'a> Session<'a> {
             self.tell(ApproachActivity::Planning);
             self.look_ahead().await?;
             let arc = if range_m > NEAR_M {
-                self.far_movement(range_m)?
+                let shell = self.hardware.shell;
+                shell.timed(work::PLANNING, || self.far_movement(range_m))?
             } else {
-                match self.near_movement()? {
+                let shell = self.hardware.shell;
+                match shell.timed(work::PLANNING, || self.near_movement())? {
                     NearStep::Move(arc) => {
                         self.near_moves_n += 1;
                         arc
@@ -247,9 +260,15 @@ impl<'a> Session<'a> {
                 .pixel_covariance(camera, pointing)
                 .ok_or_else(|| fault("target_lost", "the target is behind the camera"))?;
             let predicted_px = self.tracker.predicted_pixel(camera, &motion.now_from_last);
-            let found = self
-                .tracker
-                .update(&frame.view, &motion.now_from_last, &spread, near);
+            let eye = camera.model.cahv()[0];
+            let found = if self.shade.hides(&self.estimate.position_m, eye, HIDING_M) {
+                Err(Refusal::hidden())
+            } else {
+                self.hardware.shell.timed(work::VISION, || {
+                    self.tracker
+                        .update(&frame.view, &motion.now_from_last, &spread, near)
+                })
+            };
             sightings.push(sighting(
                 &frame.reference,
                 predicted_px,
@@ -295,7 +314,12 @@ impl<'a> Session<'a> {
         let worst_mm = sigma_mm(&self.estimate.covariance_m2)
             .iter()
             .fold(0.0_f64, |m, s| m.max(*s));
-        if self.missed_n > MISSES_N || worst_mm > MISSED_SIGMA_MM {
+        let most_n = if refusal.by_the_rover() {
+            SHADED_MISSES_N
+        } else {
+            MISSES_N
+        };
+        if self.missed_n > most_n || worst_mm > MISSED_SIGMA_MM {
             let [u_px, v_px] = sightings.last().map_or([0.0; 2], |s| s.predicted_px);
             return Err(fault("target_lost", refusal.to_string())
                 .with("range_m", range_m)
@@ -352,7 +376,12 @@ impl<'a> Session<'a> {
             .angle_deg
             .to_radians();
         let rules = HandoverRules::for_mounts(mount_rad, focal_px);
-        let found = hand_over(&view, pixel, surface, &body.view, &rules)
+        let found = self
+            .hardware
+            .shell
+            .timed(work::VISION, || {
+                hand_over(&view, pixel, surface, &body.view, &rules)
+            })
             .map_err(|e| fault("handover_failed", e.to_string()))?;
         self.budget.handed(&found, focal_px);
         let mut target = self.acceptable(&found.pixel_px, &found.surface).await?;
@@ -496,7 +525,9 @@ impl<'a> Session<'a> {
             range_max_m: 8.0,
             ..MatchRules::default()
         };
-        let points = sparse_points(&view.left, &view.right, &view.cameras, MAP_STEP_PX, &rules);
+        let points = self.hardware.shell.timed(work::VISION, || {
+            sparse_points(&view.left, &view.right, &view.cameras, MAP_STEP_PX, &rules)
+        });
         let Ok(points) = points else { return };
         let [half_x, half_y] = self.mobility.footprint_half_m;
         let own = |p: &Vector3<f64>| {
@@ -538,9 +569,8 @@ impl<'a> Session<'a> {
     /// Unit vector towards the sun in the levelled rover frame, if it is known and above the
     /// horizon.
     fn sun_in_level(&self) -> Option<Vector3<f64>> {
-        let sun = Vector3::from(self.goal.sun_in_site?);
         let turn = UnitQuaternion::from_euler_angles(0.0, 0.0, -self.wheels.pose.heading_rad);
-        (sun.z > 0.0).then(|| turn * sun)
+        sun_of(self.goal).map(|sun| turn * sun)
     }
 
     fn tell(&self, activity: ApproachActivity) {
@@ -579,6 +609,12 @@ impl IntoIsometry for UnitQuaternion<f64> {
     fn into_isometry(self) -> Isometry3<f64> {
         Isometry3::from_parts(nalgebra::Translation3::identity(), self)
     }
+}
+
+/// Unit vector towards the sun in the site frame, if it is known and above the horizon.
+fn sun_of(goal: &DriveToGoal) -> Option<Vector3<f64>> {
+    let sun = Vector3::from(goal.sun_in_site?).try_normalize(1e-9)?;
+    (sun.z > 0.0).then_some(sun)
 }
 
 fn wheels_of(frame: &Frame) -> Result<WheelsState, Fault> {

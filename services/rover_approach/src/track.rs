@@ -7,13 +7,14 @@
 
 use crate::align::{AlignRules, Freedom, Template, refine, search};
 use crate::error::TrackError;
+use crate::own_shadow::lit_alike;
 use crate::patch::HalfSize;
 use crate::relief::{AnchorGeometry, ReliefRules, corrected_pixel};
 use crate::surface::{PlaneRules, StereoPlane, SurfacePlane, measure_plane};
 use crate::view::View;
 use crate::warp::PlaneWarp;
-use nalgebra::{Isometry3, Matrix2, Vector2};
-use std::sync::Arc;
+use nalgebra::{Isometry3, Matrix2, Point3, Vector2};
+use std::{borrow::Cow, sync::Arc};
 
 /// How the target is tracked.
 #[derive(Clone, Debug, PartialEq)]
@@ -138,6 +139,25 @@ impl std::fmt::Display for Refusal {
             write!(f, "{separator}{name}: {error}")?;
         }
         Ok(())
+    }
+}
+
+impl Refusal {
+    /// Of a target that the rover itself hides: nothing was attempted, because what is seen there
+    /// is not the target.
+    #[must_use]
+    pub fn hidden() -> Self {
+        Self {
+            attempts: vec![(Attempt::Affine, TrackError::Hidden)],
+        }
+    }
+
+    /// Whether the rover's own body or shadow was in the way of an attempt.
+    #[must_use]
+    pub fn by_the_rover(&self) -> bool {
+        self.attempts
+            .iter()
+            .any(|(_, e)| matches!(e, TrackError::OwnShadow { .. } | TrackError::Hidden))
     }
 }
 
@@ -285,8 +305,9 @@ impl Tracker {
         let predicted = anchor.warp.moved(now_from_last);
         let footprint = predicted.jacobian(camera).ok_or(TrackError::NotVisible)?;
         let reach = reach(&footprint, prediction_px2, rules.search_sigma)?;
+        let template = self.lit_alike(view, anchor, now_from_last)?;
         let (found_px, score, second_score) =
-            search(&anchor.template, &view.left, camera, &predicted, reach)?;
+            search(&template, &view.left, camera, &predicted, reach)?;
         if !(score >= rules.min_search_score) {
             return Err(TrackError::LowScore {
                 score,
@@ -299,7 +320,7 @@ impl Tracker {
             .turned_to(camera, &found_px)
             .ok_or(TrackError::NotVisible)?;
         let (mut warp, mut aligned) = refine(
-            &anchor.template,
+            &template,
             &view.left,
             camera,
             &warp,
@@ -308,7 +329,7 @@ impl Tracker {
         )?;
         if freedom == Freedom::Affine {
             (warp, aligned) = refine(
-                &anchor.template,
+                &template,
                 &view.left,
                 camera,
                 &warp,
@@ -331,7 +352,7 @@ impl Tracker {
         let warp = warp
             .onto(camera, &plane.plane)
             .ok_or(TrackError::NotVisible)?;
-        let back_px = self.track_back(view, anchor, &pixel_px, &warp)?;
+        let back_px = self.track_back(view, anchor, now_from_last, &pixel_px, &warp)?;
         if !(back_px <= rules.max_back_px) {
             return Err(TrackError::NotMutual {
                 distance_px: back_px,
@@ -347,6 +368,26 @@ impl Tracker {
             second_score,
             back_px,
             sigma_px: spread.diagonal().max().sqrt(),
+        })
+    }
+
+    /// An anchor's template with the pixels that the rover's own shadow leaves.
+    fn lit_alike<'t>(
+        &self,
+        view: &View,
+        anchor: &'t Anchor,
+        now_from_last: &Isometry3<f64>,
+    ) -> Result<Cow<'t, Template>, TrackError> {
+        let template = &anchor.template;
+        let places = template.half.offsets().map(|d| {
+            let last = Point3::from(anchor.warp.point(&d)?);
+            let then = anchor.anchor_from_rover * last;
+            Some([then.coords, (now_from_last * last).coords])
+        });
+        let shadows = [anchor.view.own_shadow.as_ref(), view.own_shadow.as_ref()];
+        Ok(match lit_alike(shadows, places, template.weights())? {
+            Some(counts) => Cow::Owned(template.masked(&counts)),
+            None => Cow::Borrowed(template),
         })
     }
 
@@ -375,11 +416,22 @@ impl Tracker {
         &self,
         view: &View,
         anchor: &Anchor,
+        now_from_last: &Isometry3<f64>,
         pixel_px: &Vector2<f64>,
         warp: &PlaneWarp,
     ) -> Result<f64, TrackError> {
         let camera = &view.cameras.left;
         let template = Template::cut(&view.left, pixel_px, anchor.template.half)?;
+        let anchor_from_now = anchor.anchor_from_rover * now_from_last.inverse();
+        let places = template.half.offsets().map(|d| {
+            let here = warp.point(&warp.offset(camera, &(pixel_px + d))?)?;
+            Some([(anchor_from_now * Point3::from(here)).coords, here])
+        });
+        let shadows = [anchor.view.own_shadow.as_ref(), view.own_shadow.as_ref()];
+        let template = match lit_alike(shadows, places, template.weights())? {
+            Some(counts) => template.masked(&counts),
+            None => template,
+        };
         let back = warp
             .jacobian(camera)
             .and_then(|j| j.try_inverse())

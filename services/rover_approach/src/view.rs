@@ -1,6 +1,7 @@
 //! One stereo frame as the algorithms see it: both images made ready, and their camera models.
 
 use crate::error::TrackError;
+use crate::own_shadow::OwnShadow;
 use rover_cameras::StereoPair;
 use rover_vision::PreparedImage;
 
@@ -13,6 +14,8 @@ pub struct View {
     pub right: PreparedImage,
     /// Believed camera models, rover frame of this stop, m.
     pub cameras: StereoPair,
+    /// Where the rover's own shadow falls, if sun and shape are known.
+    pub own_shadow: Option<OwnShadow>,
 }
 
 impl View {
@@ -48,6 +51,14 @@ impl View {
             left,
             right,
             cameras,
+            own_shadow: None,
         })
+    }
+
+    /// The same with the rover's own shadow known.
+    #[must_use]
+    pub fn shadowed(mut self, own_shadow: Option<OwnShadow>) -> Self {
+        self.own_shadow = own_shadow;
+        self
     }
 }

@@ -4,21 +4,18 @@ use crate::{SERVICE, check_pixel, check_reach, is_distant, target_at};
 use rover_bus::{BusError, Peer, Stream};
 use rover_messages::{
     Fault, keys,
+    status::work,
     target::{SelectRequest, Target},
 };
 use rover_robot::Robot;
-use rover_service::{Service, ServiceShell, Starting, frames};
+use rover_service::{Service, ServiceShell, frames};
 use std::sync::Arc;
 
 /// Starts the service on `peer`; it lives as long as the returned value.
 ///
 /// # Errors
 /// [`BusError`] when a key cannot be declared or the name is taken.
-pub fn serve(peer: &Peer, robot: Arc<Robot>) -> Starting<'_, Service> {
-    Box::pin(start(peer, robot))
-}
-
-async fn start(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
+pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> {
     let shell = ServiceShell::new(peer, &robot, SERVICE).await?;
     let desk = Arc::new(Desk {
         peer: peer.clone(),
@@ -64,9 +61,9 @@ impl Desk {
             .clone();
         check_pixel(request.pixel_px, &pair)?;
         let frame = frames::capture(&self.peer, SERVICE, &pair.name).await?;
-        let robot = self.robot.clone();
+        let (robot, shell) = (self.robot.clone(), self.shell.clone());
         tokio::task::spawn_blocking(move || {
-            let target = target_at(&request, &frame, &pair)?;
+            let target = shell.timed(work::VISION, || target_at(&request, &frame, &pair))?;
             if !is_distant(&pair) {
                 check_reach(&robot, &target)?;
             }
