@@ -109,8 +109,9 @@ impl RoverPhysics {
         p.contact_softness = softness;
         p.static_contact_softness = softness;
         p.max_ccd_substeps = 0;
-        // More than twice the speed at which the solver sees only the triangles underneath.
-        p.normalized_prediction_distance = 0.0005;
+        // Twice as far as a wheel comes in a step at full speed: nearer, and a wheel may be deep in a
+        // stone before the solver knows it; farther, and it sees triangles by the dozen.
+        p.normalized_prediction_distance = 0.001;
         let statics = terrain_colliders(terrain, dynamics.friction)?
             .into_iter()
             .map(|c| c.map(|c| world.insert_collider(c, None)))

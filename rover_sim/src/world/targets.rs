@@ -21,6 +21,10 @@ const AHEAD_RAD: f64 = 0.5;
 /// Rocks smaller than this are not picked, m.
 const ROCK_M: f64 = 0.10;
 
+/// Distances to the next edge that are asked for, one after the other: ten, six and three pixels
+/// of a mast camera, rad.
+const MARGINS_RAD: [f64; 3] = [0.008, 0.005, 0.0025];
+
 /// What a pixel showed when it was named.
 #[derive(Clone, Debug)]
 pub(crate) struct Designation {
@@ -87,14 +91,18 @@ impl World {
     /// # Errors
     /// Fault `no_place` with the number of places tried.
     pub fn pick(&self, request: &PickRequest) -> Result<Pick, Fault> {
-        const TRIES: u32 = 4000;
+        const TRIES: u32 = 2000;
         let world_from_rover = self.world_from_rover().unwrap_or_else(Isometry3::identity);
         let eye = self.lookout(&world_from_rover);
         let mut random = ChaCha8Rng::seed_from_u64(self.origin.0);
         random.set_stream(40 + u64::from(request.choice_n));
         let yaw = world_from_rover.rotation.euler_angles().2;
         let [near, far] = request.range_m;
-        for _ in 0..TRIES {
+        // A person prefers the middle of a surface, and takes what there is.
+        let margins = MARGINS_RAD
+            .into_iter()
+            .flat_map(|m| (0..TRIES).map(move |_| m));
+        for margin_rad in margins {
             let [u, v]: [f64; 2] = std::array::from_fn(|_| random.random());
             let range = near + u * (far - near);
             let azimuth = yaw + (2.0 * v - 1.0) * AHEAD_RAD;
@@ -129,7 +137,7 @@ impl World {
             if !fits
                 || !(near..=far).contains(&place.range_m)
                 || !self.is_lit(&found)
-                || !self.is_plain(&eye, &found)
+                || !self.is_plain(&eye, &found, margin_rad)
             {
                 continue;
             }
@@ -146,11 +154,12 @@ impl World {
                 pixel_px,
             });
         }
+        let tried_n = TRIES * MARGINS_RAD.len() as u32;
         let message = format!(
             "no {:?} between {near} and {far} m that faces the rover, {TRIES} places tried",
             request.surface
         );
-        Err(Fault::new(HARDWARE, "no_place", message).with("tried_n", f64::from(TRIES)))
+        Err(Fault::new(HARDWARE, "no_place", message).with("tried_n", f64::from(tried_n)))
     }
 
     /// Whether the sun shines on a surface point.
@@ -172,18 +181,17 @@ impl World {
             && lock(&self.eyes).first_on(&start, &towards).is_none()
     }
 
-    /// Whether what surrounds a surface point, as seen from `eye`, is the same surface: nobody
-    /// names a target on an edge.
-    fn is_plain(&self, eye: &Vector3<f64>, place: &SurfacePoint) -> bool {
-        /// Distance of what must be alike: m, and rad as seen from the eye (ten pixels of a mast
-        /// camera).
-        const AROUND: (f64, f64) = (0.03, 0.008);
+    /// Whether what surrounds a surface point by `margin_rad` as seen from `eye` is the same
+    /// surface: nobody names a target on an edge.
+    fn is_plain(&self, eye: &Vector3<f64>, place: &SurfacePoint, margin_rad: f64) -> bool {
+        /// Least distance of what must be alike, m.
+        const AROUND_M: f64 = 0.03;
         /// Largest step in range, m, and largest angle between the normals, rad.
         const STEP_M: f64 = 0.10;
         const BEND_RAD: f64 = 0.7;
         let along = place.point_m - eye;
         let (range_m, along) = (along.norm(), along.normalize());
-        let around_m = AROUND.0.max(AROUND.1 * range_m);
+        let around_m = AROUND_M.max(margin_rad * range_m);
         let aside = along.cross(&Vector3::z()).normalize();
         let up = aside.cross(&along);
         (0..8).map(|i| f64::from(i) * FRAC_PI_4).all(|angle| {

@@ -108,7 +108,7 @@ impl PlaneRules {
 /// px.
 const GRID_PX: [i32; 2] = [4, 8];
 /// Fewest of those points.
-const GRID_POINTS_N: usize = 6;
+const GRID_POINTS_N: usize = 4;
 
 /// The surface around a left pixel that is seen from afar: position and normal from the one match
 /// of the pixel's window, plane rms and roughness from single points around it. At such ranges both
@@ -125,7 +125,15 @@ pub fn measure_distant_surface(
 ) -> Result<Surface, SurfaceFailure> {
     let matching = rules.matching(range_m, &[]);
     let refused = |failure| SurfaceFailure::of_match(failure, &matching);
-    let found = match_point(left, right, cameras, pixel_px, &matching).map_err(refused)?;
+    let (found, rules) = settled(rules, |rules| {
+        let matching = rules.matching(range_m, &[]);
+        Ok((
+            match_point(left, right, cameras, pixel_px, &matching)?,
+            rules.clone(),
+        ))
+    })
+    .map_err(refused)?;
+    let rules = &rules;
     let facing_away = SurfaceFailure::NormalFacingAway {
         cosine: 0.0,
         limit: 0.0,
@@ -190,20 +198,29 @@ pub fn measure_plane(
     rules: &PlaneRules,
 ) -> Result<StereoPlane, PlaneFailure> {
     let normals: Vec<Vector3<f64>> = normal.copied().into_iter().collect();
-    let measured = |rules: &PlaneRules| {
+    settled(rules, |rules| {
         let matching = rules.matching(range_m, &normals);
         let found = match_point(left, right, cameras, pixel_px, &matching)?;
-        plane_of(cameras, &found, rules).ok_or(PlaneFailure::EdgeOn)
-    };
-    // A fit that wanders has too little in its window to hold on to.
-    let larger = PlaneRules {
-        half_window_px: rules.half_window_px * 3 / 2,
+        Ok(plane_of(cameras, &found, rules))
+    })?
+    .ok_or(PlaneFailure::EdgeOn)
+}
+
+/// Measures with the window of `rules`. A fit that wanders has too little in its window to hold on
+/// to, or the edge of another surface: then a larger one is tried, and a smaller one.
+fn settled<T>(
+    rules: &PlaneRules,
+    measured: impl Fn(&PlaneRules) -> Result<T, MatchFailure>,
+) -> Result<T, MatchFailure> {
+    let sized = |half_window_px| PlaneRules {
+        half_window_px,
         ..rules.clone()
     };
+    let half = rules.half_window_px;
     measured(rules).or_else(|failure| match failure {
-        PlaneFailure::Match(MatchFailure::Diverged { .. }) => {
-            measured(&larger).map_err(|_| failure)
-        }
+        MatchFailure::Diverged { .. } => measured(&sized(half * 3 / 2))
+            .or_else(|_| measured(&sized((half * 7 / 10).max(4))))
+            .map_err(|_| failure),
         _ => Err(failure),
     })
 }

@@ -32,7 +32,9 @@ pub(super) struct Refined {
     pub sigma_px: f64,
 }
 
-const MAX_STEPS: usize = 12;
+const MAX_STEPS: usize = 20;
+/// Steps after which only half of each is taken.
+const FULL_STEPS: usize = 8;
 /// A fit has settled when a step moves window middle and edges by less, px.
 const SETTLED_PX: f64 = 0.002;
 /// Slopes that change by more than this since the derivatives were taken have them taken anew.
@@ -214,7 +216,7 @@ pub(super) fn refine(
     let mut samples = vec![0.0f32; count];
     let mut padded = vec![0.0f32; window.values.len()];
     let mut derivatives = Derivatives::new(window, link, now.slopes, hold).ok_or_else(singular)?;
-    for _ in 0..MAX_STEPS {
+    for taken in 0..MAX_STEPS {
         let matrix = link.matrix(&now.slopes);
         let origin = link.at
             + matrix * window.first
@@ -251,10 +253,12 @@ pub(super) fn refine(
                 limit: rules.min_score,
             });
         }
+        // Derivatives of the left window alone may overshoot for ever about the right answer.
+        let part = if taken < FULL_STEPS { 1.0 } else { 0.5 };
         let step = Displacement {
-            along_px: -x[0] / gain,
-            slopes: Vector2::new(-x[1], -x[2]) / (gain * half),
-            across_px: -x[3] / gain,
+            along_px: -x[0] / gain * part,
+            slopes: Vector2::new(-x[1], -x[2]) / (gain * half) * part,
+            across_px: -x[3] / gain * part,
         };
         now.along_px += step.along_px.clamp(-1.0, 1.0);
         now.slopes += step.slopes.map(|s| s.clamp(-0.3, 0.3));
