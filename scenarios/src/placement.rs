@@ -20,7 +20,7 @@ use rover_bus::{BusError, Peer};
 use rover_kinematics::{AxisGoal, closest_solution};
 use rover_messages::{
     Fault, Nothing,
-    approach::{DriveToFeedback, DriveToResult},
+    approach::{BasePose, DriveToFeedback, DriveToResult},
     arm::{ArmState, ExecuteFeedback, ExecuteGoal, ExecuteResult, Guard},
     keys,
     mobility::WheelsState,
@@ -41,6 +41,8 @@ pub const RUNNER: &str = "runner";
 
 /// Longest wait for an action to end after it was cancelled.
 const CANCEL_LIMIT: Duration = Duration::from_secs(5);
+/// Base poses from which a placement is tried if the scenario does not say.
+const MOST_BASE_POSES_N: u32 = 3;
 
 /// Who watches a run; the methods return at once.
 pub trait Observer: Send {
@@ -81,6 +83,8 @@ pub struct Mission<'a> {
 struct Record {
     target: Option<Target>,
     approach: Option<DriveToResult>,
+    /// Base poses left again, with the fault of the placement from there.
+    earlier: Vec<(BasePose, Fault)>,
     placed: Option<PlaceResult>,
     contact: Option<ContactReport>,
     score: Option<Score>,
@@ -135,7 +139,7 @@ impl<'a> Mission<'a> {
             }
         }
         if ended.is_ok() && !self.scenario.arm.end_posture.is_empty() {
-            ended = self.stow().await;
+            ended = self.take_up(&self.scenario.arm.end_posture).await;
             if ended.is_err() {
                 self.stop().await;
             }
@@ -151,22 +155,43 @@ impl<'a> Mission<'a> {
 
     /// Everything up to contact.
     async fn place(&mut self, record: &mut Record) -> Result<(), Fault> {
-        let (peer, scenario) = (self.peer, self.scenario);
-        let question_limit = scenario.limits.question();
+        let scenario = self.scenario;
         self.sim_time_s = self.now_s().await.unwrap_or_default();
 
         let (target, anchor) = self.designate().await?;
         record.target = Some(target.clone());
-        let target = match &scenario.approach_under_the_sun() {
+        match &scenario.approach_under_the_sun() {
             Some(settings) => {
-                let reached = self.drive_to(settings.goal(&target, anchor)).await?;
-                record.approach = Some(reached.clone());
-                record.waypoints = self.waypoints(&reached).await?;
-                reached.target
+                let goal = settings.goal(&target, anchor);
+                let most_n = settings.max_base_poses_n.unwrap_or(MOST_BASE_POSES_N);
+                self.place_from_somewhere(record, goal, most_n).await
             }
-            None => target,
-        };
+            None => self.place_from_here(record, &target).await,
+        }
+    }
 
+    /// To the standoff and on to contact.
+    async fn place_from_here(&mut self, record: &mut Record, target: &Target) -> Result<(), Fault> {
+        let (peer, question_limit) = (self.peer, self.scenario.limits.question());
+        let placed = self.to_standoff(target).await?;
+        if let Some(evidence) = &mut self.evidence {
+            evidence.looks.clone_from(&placed.looks);
+            evidence
+                .at_standoff(peer, &target.pair, question_limit)
+                .await;
+        }
+        record.placed = Some(placed.clone());
+        if self.is_simulated().await {
+            let truth: TruthState = self.ask(keys::SIM_TRUTH_STATE, &Nothing {}).await?;
+            record.waypoints.at_standoff(&truth);
+        }
+        self.contact(record, target, &placed).await
+    }
+
+    /// Surveys the ground before the arm and brings the instrument to the standoff.
+    async fn to_standoff(&mut self, target: &Target) -> Result<PlaceResult, Fault> {
+        let (peer, scenario) = (self.peer, self.scenario);
+        let question_limit = scenario.limits.question();
         let started = self.begin("survey");
         let request = SurveyRequest {
             pair: target.pair.clone(),
@@ -179,7 +204,7 @@ impl<'a> Mission<'a> {
         self.end(started, surveyed).await?;
 
         let started = self.begin("servo");
-        let goal = scenario.place_goal(&target);
+        let goal = scenario.place_goal(target);
         let (observer, evidence) = (&mut *self.observer, &mut self.evidence);
         let placed = act(
             peer,
@@ -195,21 +220,20 @@ impl<'a> Mission<'a> {
             },
         )
         .await;
-        let placed: PlaceResult = self.end(started, placed).await?;
-        if let Some(evidence) = &mut self.evidence {
-            evidence.looks.clone_from(&placed.looks);
-            evidence
-                .at_standoff(peer, &target.pair, question_limit)
-                .await;
-        }
-        record.placed = Some(placed.clone());
-        if self.is_simulated().await {
-            let truth: TruthState = self.ask(keys::SIM_TRUTH_STATE, &Nothing {}).await?;
-            record.waypoints.at_standoff(&truth);
-        }
+        self.end(started, placed).await
+    }
 
+    /// Drives the instrument along the normal until the switch closes.
+    async fn contact(
+        &mut self,
+        record: &mut Record,
+        target: &Target,
+        placed: &PlaceResult,
+    ) -> Result<(), Fault> {
+        let (peer, scenario) = (self.peer, self.scenario);
+        let question_limit = scenario.limits.question();
         let started = self.begin("contact");
-        let goal = scenario.contact_goal(&target, &placed);
+        let goal = scenario.contact_goal(target, placed);
         let (observer, evidence) = (&mut *self.observer, &mut self.evidence);
         let contact = act(
             peer,
@@ -263,12 +287,12 @@ impl<'a> Mission<'a> {
         self.end(started, scored).await
     }
 
-    /// Brings the arm to the scenario's end posture.
-    async fn stow(&mut self) -> Result<(), Fault> {
+    /// Brings the arm to a posture in which it can be left.
+    async fn take_up(&mut self, posture: &str) -> Result<(), Fault> {
         let started = self.begin("stow");
         let request = PlanRequest {
             start_rad: None,
-            goal: PlanGoal::Posture(self.scenario.arm.end_posture.clone()),
+            goal: PlanGoal::Posture(posture.into()),
             speed_fraction: 1.0,
             max_tip_speed_m_s: None,
             contact_radius_m: 0.0,
@@ -392,7 +416,10 @@ impl<'a> Mission<'a> {
             reason: ended.map(|fault| format!("{}: {}", fault.name, fault.message)),
             phases: self.phases.clone(),
             target: record.target.as_ref().map(TargetReport::from),
-            approach: record.approach.as_ref().map(ApproachReport::from),
+            approach: record
+                .approach
+                .as_ref()
+                .map(|reached| ApproachReport::new(reached, &record.earlier)),
             servo: record
                 .placed
                 .as_ref()

@@ -4,7 +4,7 @@
 
 mod approach;
 
-pub use approach::{ApproachReport, ErrorSources, StopReport, Waypoints};
+pub use approach::{ApproachReport, EarlierBase, ErrorSources, StopReport, Waypoints};
 
 use rover_messages::{
     Fault,

@@ -49,6 +49,9 @@ pub struct DriveToGoal {
     /// be reached, m; 0 for the target alone.
     #[serde(default)]
     pub spot_radius_m: f64,
+    /// Base poses from which the placement has failed already: none like them is chosen again.
+    #[serde(default)]
+    pub avoid: Vec<SitePose>,
 }
 
 /// What the approach is doing.
@@ -173,6 +176,8 @@ pub struct DriveToResult {
     pub budget: Vec<ErrorShare>,
     /// The target in the left image of the pair that tracked it, as it was handed over, px.
     pub tracked_px: [f64; 2],
+    /// That image.
+    pub tracked_in: FrameReference,
     /// Distance between the pixel predicted by geometry alone and the matched one at the
     /// handover, px.
     pub handover_px: f64,
@@ -187,7 +192,7 @@ pub struct DriveToResult {
 wire! { DriveToFeedback = "drive_to_feedback/2" }
 
 impl Wire for DriveToGoal {
-    const SCHEMA: &'static str = "drive_to_goal/2";
+    const SCHEMA: &'static str = "drive_to_goal/3";
     fn validate(&self) -> Result<(), String> {
         self.target.validate().map_err(|e| format!("target.{e}"))?;
         if self.anchor.pair != self.target.pair {
@@ -212,12 +217,17 @@ impl Wire for DriveToGoal {
             let length = sun.iter().map(|x| x * x).sum::<f64>().sqrt();
             in_range("sun_in_site (length)", length, 1.0 - 1e-6, 1.0 + 1e-6)?;
         }
+        for (i, pose) in self.avoid.iter().enumerate() {
+            let place = pose.position_m.coords;
+            let numbers = [place.x, place.y, place.z, pose.heading_rad];
+            finite(&format!("avoid[{i}]"), &numbers)?;
+        }
         in_range("spot_radius_m", self.spot_radius_m, 0.0, 1.0)
     }
 }
 
 impl Wire for DriveToResult {
-    const SCHEMA: &'static str = "drive_to_result/2";
+    const SCHEMA: &'static str = "drive_to_result/3";
     fn validate(&self) -> Result<(), String> {
         self.target.validate().map_err(|e| format!("target.{e}"))?;
         finite("tracked_px", &self.tracked_px)?;

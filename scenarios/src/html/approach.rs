@@ -106,6 +106,16 @@ pub(super) fn approach(report: &RunReport, evidence: &Evidence) -> Result<String
             escape(&a.target.pair),
             a.handover_px,
         );
+        for earlier in &a.earlier {
+            let [x, y, _] = earlier.position_m;
+            let _ = write!(
+                out,
+                "<p>Left again: base pose at {x:.2}, {y:.2} m of the site frame, heading {:.0} deg: \
+                 {}.</p>",
+                earlier.heading_rad.to_degrees(),
+                escape(&earlier.reason)
+            );
+        }
         out += &base(a);
         out += &budget(report, a);
     }

@@ -1,16 +1,44 @@
 //! From the choice of a target to standing before it.
 
-use super::{Mission, RUNNER, act, unless};
+use super::{Mission, RUNNER, Record, act, unless};
 use crate::report::Waypoints;
+use nalgebra::Vector3;
+use rover_geometry::Point;
 use rover_messages::{
     Fault,
     approach::{DriveToFeedback, DriveToGoal, DriveToResult},
     imaging::{CaptureRequest, FrameReference, StereoFrame},
-    keys,
+    keys::{
+        self,
+        service::{ARM_PLANNER, EPEC_SERVO},
+    },
     mobility::{PointFeedback, PointGoal, PointResult},
     simulation::{DesignateRequest, Pick, PickRequest, TruePlace},
     target::{SelectRequest, Target},
 };
+
+/// The posture in which the rover drives.
+const STOWED: &str = "stow";
+
+/// Whether a placement that ended so may succeed from another base pose: nothing was broken or
+/// interrupted, but arm, ground and cameras did not go together where the rover stood.
+fn may_go_elsewhere(fault: &Fault) -> bool {
+    const OF_THE_PLACE: [&str; 11] = [
+        "axis_infeasible",
+        "branch_change",
+        "corrected_pose_out_of_reach",
+        "fiducial_lost",
+        "fiducial_not_visible",
+        "joint_limit",
+        "no_collision_free_path",
+        "no_solution",
+        "not_converging",
+        "predicted_error_too_large",
+        "target_out_of_reach",
+    ];
+    [ARM_PLANNER, EPEC_SERVO].contains(&fault.service.as_str())
+        && OF_THE_PLACE.contains(&fault.name.as_str())
+}
 
 impl Mission<'_> {
     /// Has the target selected: the scenario's pixel, or one that the simulator picks as a person
@@ -88,6 +116,39 @@ impl Mission<'_> {
         )
         .await
         .map(|_| ())
+    }
+
+    /// Drives to the target and places the instrument; where the arm cannot serve
+    /// it from the base pose after all, from another one.
+    pub(super) async fn place_from_somewhere(
+        &mut self,
+        record: &mut Record,
+        mut goal: DriveToGoal,
+        most_n: u32,
+    ) -> Result<(), Fault> {
+        loop {
+            let reached = self.drive_to(goal.clone()).await?;
+            record.approach = Some(reached.clone());
+            record.waypoints = self.waypoints(&reached).await?;
+            let Err(fault) = self.place_from_here(record, &reached.target).await else {
+                return Ok(());
+            };
+            record.earlier.push((reached.base.clone(), fault.clone()));
+            if !may_go_elsewhere(&fault) || record.earlier.len() as u32 >= most_n {
+                return Err(fault);
+            }
+            tracing::info!(%fault, "another base pose is tried");
+            self.take_up(STOWED).await?;
+            goal.avoid.push(reached.base.pose);
+            goal.target.pixel_px = reached.tracked_px;
+            goal.anchor = reached.tracked_in;
+            if let Some(stop) = reached.stops.last() {
+                goal.target.position_m = Point::from(Vector3::from(stop.position_m));
+            }
+            if let Some(limit_m) = &mut goal.limits.max_distance_m {
+                *limit_m = (*limit_m - reached.driven_m).max(0.0);
+            }
+        }
     }
 
     /// Drives to the target and has it handed over to the pair that the arm works with.

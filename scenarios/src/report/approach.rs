@@ -2,7 +2,8 @@
 
 use nalgebra::Vector3;
 use rover_messages::{
-    approach::DriveToResult,
+    Fault,
+    approach::{BasePose, DriveToResult},
     simulation::{Score, TruePlace, TruthState},
 };
 use serde::{Deserialize, Serialize};
@@ -30,8 +31,23 @@ pub struct ApproachReport {
     pub candidates_n: u32,
     /// What refused base poses, and how many each.
     pub refused: BTreeMap<String, u32>,
+    /// Base poses from which the placement failed, in order.
+    #[serde(default)]
+    pub earlier: Vec<EarlierBase>,
     /// The target in the pair that the arm works with.
     pub target: super::TargetReport,
+}
+
+/// A base pose that was left again.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EarlierBase {
+    /// Where the rover stood, site frame, m.
+    pub position_m: [f64; 3],
+    /// Its heading, rad.
+    pub heading_rad: f64,
+    /// Why the placement failed from there: `name: message`.
+    pub reason: String,
 }
 
 /// One stop.
@@ -109,8 +125,14 @@ impl Waypoints {
     }
 }
 
-impl From<&DriveToResult> for ApproachReport {
-    fn from(r: &DriveToResult) -> Self {
+impl ApproachReport {
+    /// The report of an approach, with the base poses tried in vain.
+    pub(crate) fn new(r: &DriveToResult, earlier: &[(BasePose, Fault)]) -> Self {
+        let left = |(base, fault): &(BasePose, Fault)| EarlierBase {
+            position_m: base.pose.position_m.coords.into(),
+            heading_rad: base.pose.heading_rad,
+            reason: format!("{}: {}", fault.name, fault.message),
+        };
         let stop = |s: &rover_messages::approach::ApproachStop| {
             let accepted = s.sightings.iter().rev().find(|x| x.pixel_px.is_some());
             StopReport {
@@ -133,20 +155,23 @@ impl From<&DriveToResult> for ApproachReport {
             base: r.base.quality.clone(),
             candidates_n: r.base.candidates_n,
             refused: r.base.refused.clone(),
+            earlier: earlier.iter().map(left).collect(),
             target: (&r.target).into(),
         }
     }
-}
 
-impl ApproachReport {
     /// One line for a person.
     pub(super) fn summary(&self) -> String {
         let looks: u32 = self.stops.iter().map(|s| s.looks_n).sum();
         let spot = self.spot_offset_mm.map_or_else(String::new, |d| {
             format!(", another spot {:.0} mm away", Vector3::from(d).norm())
         });
+        let earlier = match self.earlier.len() {
+            0 => String::new(),
+            n => format!(", {n} base poses in vain"),
+        };
         format!(
-            "{:.2} m in {} stops, {looks} looks, handed over within {:.2} px{spot}",
+            "{:.2} m in {} stops, {looks} looks, handed over within {:.2} px{spot}{earlier}",
             self.driven_m,
             self.stops.len(),
             self.handover_px

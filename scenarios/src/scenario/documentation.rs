@@ -52,6 +52,10 @@ const FIELDS: &[(&str, &str)] = &[
         "Near the target: largest uncertainty of its position at which to go on, mm, one sigma.",
     ),
     (
+        "approach.max_base_poses_n",
+        "Base poses from which the placement is tried at most; without it 3.",
+    ),
+    (
         "approach.sun_deg",
         "Azimuth (from the rover's first heading to its left) and elevation of the sun, deg; without it those of the simulated sun.",
     ),

@@ -65,6 +65,9 @@ pub struct ApproachSettings {
     /// sigma.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_sigma_mm: Option<f64>,
+    /// Base poses from which the placement is tried at most.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_base_poses_n: Option<u32>,
     /// Azimuth (from the rover's first heading to its left) and elevation of the sun, deg; if not
     /// given, those of the simulated sun.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -167,6 +170,12 @@ impl ApproachSettings {
             ("max_slope_deg", self.max_slope_deg, 0.0, 60.0),
             ("max_slip", self.max_slip, 0.0, 1.0),
             ("max_sigma_mm", self.max_sigma_mm, 0.1, 1e4),
+            (
+                "max_base_poses_n",
+                self.max_base_poses_n.map(f64::from),
+                1.0,
+                100.0,
+            ),
             ("spot_radius_mm", Some(self.spot_radius_mm), 0.0, 1e3),
         ] {
             if let Some(value) = value {
@@ -200,6 +209,7 @@ impl ApproachSettings {
                 max_sigma_mm: self.max_sigma_mm,
             },
             spot_radius_m: self.spot_radius_mm * 1e-3,
+            avoid: Vec::new(),
         }
     }
 }

@@ -41,6 +41,11 @@ pub struct BaseRules {
     pub shade_margin_m: f64,
     /// Distance of the rover's parts from the line of sight of the mast's cameras, m.
     pub view_margin_m: f64,
+    /// Distance that the arm keeps from the target's tangent plane and from the ground where it can,
+    /// m: what its planner may ask for.
+    pub terrain_margin_m: f64,
+    /// Poses that differ by less (m and rad) are the same one.
+    pub apart: [f64; 2],
 }
 
 impl Default for BaseRules {
@@ -58,6 +63,8 @@ impl Default for BaseRules {
             max_slope_rad: 0.26,
             shade_margin_m: 0.06,
             view_margin_m: 0.06,
+            terrain_margin_m: 0.04,
+            apart: [0.20, 0.30],
         }
     }
 }
@@ -115,7 +122,7 @@ pub struct BaseChoice {
 }
 
 /// What a base pose is judged with.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct BaseTask<'a> {
     /// The robot as believed.
     pub robot: &'a Robot,
@@ -129,6 +136,8 @@ pub struct BaseTask<'a> {
     pub shade: &'a Shade,
     /// Unit vector towards the sun in the frame of the target, if it is known.
     pub sun: Option<Vector3<f64>>,
+    /// Poses not to be chosen again, frame of the target.
+    pub avoid: Vec<PlanarPose>,
 }
 
 /// The target in some rover frame.
@@ -206,6 +215,9 @@ impl BaseTask<'_> {
         target: &TargetSpot,
         map: &GroundMap,
     ) -> Result<Serving, String> {
+        if self.is_avoided(pose) {
+            return Err("tried_before".into());
+        }
         let standing = map
             .standing(pose, self.mobility, self.rules.max_slope_rad)
             .map_err(|hazard| hazard.name().to_string())?;
@@ -233,7 +245,8 @@ impl BaseTask<'_> {
     ///
     /// # Errors
     /// The name of the first condition that is not met: `target_out_of_view`,
-    /// `hidden_by_the_rover`, `target_out_of_reach`, `joint_limit`, `singular`, `fiducial_hidden`.
+    /// `hidden_by_the_rover`, `target_out_of_reach`, `joint_limit`, `singular`, `fiducial_hidden`,
+    /// `arm_in_the_terrain`.
     pub fn serve(&self, spot: &TargetSpot) -> Result<Serving, String> {
         let r = self.rules;
         let pair = &self.body.cameras;
@@ -291,9 +304,18 @@ impl BaseTask<'_> {
                 continue;
             };
             let facing_rad = facing.into_iter().fold(0.0, f64::max);
+            let postures = before.iter().copied().chain([touch]);
+            let room_m = postures
+                .filter_map(|s| self.room_m(spot, &s.joints_rad))
+                .fold(r.terrain_margin_m, f64::min);
+            if room_m < 0.0 {
+                reason = "arm_in_the_terrain";
+                continue;
+            }
             let score = manipulability.min(0.5)
                 + 0.5 * limit_rad.min(0.5)
-                + 0.5 * (1.0 - facing_rad / r.max_facing_rad);
+                + 0.5 * (1.0 - facing_rad / r.max_facing_rad)
+                + room_m / r.terrain_margin_m;
             if best.as_ref().is_none_or(|b| score > b.score) {
                 best = Some(Serving {
                     pose: PlanarPose {
@@ -313,6 +335,49 @@ impl BaseTask<'_> {
             }
         }
         best.ok_or_else(|| reason.to_string())
+    }
+
+    /// Distance of the arm from the tangent plane at the target, near the target, and from the
+    /// ground on which the rover stands, m; `spot` in the rover's frame. The last link is left
+    /// out: it is to go there. None for joint angles that are none of this arm.
+    fn room_m(&self, spot: &TargetSpot, joints_rad: &[f64]) -> Option<f64> {
+        /// Farther aside the surface is another one, m.
+        const NEAR_M: f64 = 0.25;
+        /// Places looked at on each shape.
+        const PLACES: u32 = 5;
+        let robot = self.robot;
+        let frames = robot.arm.link_poses(joints_rad).ok()?;
+        let joints = &robot.description().arm.joints;
+        let mut room_m = f64::INFINITY;
+        let links = frames.iter().skip(1).zip(joints);
+        for (frame, joint) in links.take(joints.len().saturating_sub(1)).skip(1) {
+            let rover_from_link = robot.rover_from_arm_base.isometry * frame;
+            for shape in &joint.shape {
+                let [a, b] = [shape.from_m, shape.to_m].map(Vector3::from);
+                for k in 0..PLACES {
+                    let part = f64::from(k) / f64::from(PLACES - 1);
+                    let place = (rover_from_link * Point3::from(a + (b - a) * part)).coords;
+                    let away = place - spot.position_m;
+                    let above = away.dot(&spot.normal);
+                    if (away - spot.normal * above).norm() < NEAR_M {
+                        room_m = room_m.min(above - shape.radius_m);
+                    }
+                    room_m = room_m.min(place.z - shape.radius_m);
+                }
+            }
+        }
+        Some(room_m)
+    }
+
+    /// Whether a pose is one of those not to be chosen again, or all but the same.
+    #[must_use]
+    pub fn is_avoided(&self, pose: &PlanarPose) -> bool {
+        let [apart_m, apart_rad] = self.rules.apart;
+        self.avoid.iter().any(|other| {
+            let away_m = (pose.x_m - other.x_m).hypot(pose.y_m - other.y_m);
+            let turn = pose.heading_rad - other.heading_rad;
+            away_m < apart_m && turn.sin().atan2(turn.cos()).abs() < apart_rad
+        })
     }
 
     /// Whether the rover shades the target `spot` (frame of the rover that stands there, turned
@@ -431,6 +496,7 @@ mod tests {
             rules: &BaseRules::default(),
             shade: &Shade::of(&robot, robot.posture("stow").unwrap()),
             sun: None,
+            avoid: Vec::new(),
         };
         let spot = TargetSpot {
             position_m: target.into(),

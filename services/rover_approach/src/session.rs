@@ -414,6 +414,7 @@ impl<'a> Session<'a> {
             spot_offset_m: self.spot_offset_m.map(Into::into),
             budget: self.budget.shares(),
             tracked_px,
+            tracked_in: self.now.reference.clone(),
             handover_px: (found.pixel_px - found.geometric_px).norm(),
             base: BasePose {
                 pose: self.wheels.pose,

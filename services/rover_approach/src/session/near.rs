@@ -9,7 +9,10 @@ use crate::service::unfit;
 use crate::surface::measure_plane;
 use nalgebra::{Point3, Vector2, Vector3};
 use rover_geometry::tangent_basis;
-use rover_messages::{Fault, mobility::DriveArc};
+use rover_messages::{
+    Fault,
+    mobility::{DriveArc, SitePose},
+};
 use std::sync::Arc;
 
 /// Base poses to which a way around is looked for.
@@ -174,7 +177,14 @@ impl Session<'_> {
         let level = self.level_from_rover();
         let rules = BaseRules::default();
         let task = self.task(&rules)?;
-        Ok(if task.shades(spot, &level.rotation.inverse()) {
+        let here = PlanarPose {
+            x_m: 0.0,
+            y_m: 0.0,
+            heading_rad: 0.0,
+        };
+        Ok(if task.is_avoided(&here) {
+            Err("tried_before".to_string())
+        } else if task.shades(spot, &level.rotation.inverse()) {
             Err("own_shadow".to_string())
         } else {
             task.serve(spot)
@@ -207,6 +217,12 @@ impl Session<'_> {
             rules,
             shade: &self.shade,
             sun: self.sun_in_level(),
+            avoid: self
+                .goal
+                .avoid
+                .iter()
+                .map(|p| self.in_level(&planar(p)))
+                .collect(),
         })
     }
 
@@ -220,12 +236,7 @@ impl Session<'_> {
 
     /// Where the rover stands, site frame.
     fn standing(&self) -> PlanarPose {
-        let pose = &self.wheels.pose;
-        PlanarPose {
-            x_m: pose.position_m.coords.x,
-            y_m: pose.position_m.coords.y,
-            heading_rad: pose.heading_rad,
-        }
+        planar(&self.wheels.pose)
     }
 
     fn in_site(&self, in_level: &PlanarPose) -> PlanarPose {
@@ -248,5 +259,13 @@ impl Session<'_> {
             y_m: place.y,
             heading_rad: turn - whole * (turn / whole).round(),
         }
+    }
+}
+
+fn planar(pose: &SitePose) -> PlanarPose {
+    PlanarPose {
+        x_m: pose.position_m.coords.x,
+        y_m: pose.position_m.coords.y,
+        heading_rad: pose.heading_rad,
     }
 }
