@@ -18,6 +18,7 @@ pub struct TerminalProgress {
     bar: ProgressBar,
     phase: String,
     error_mm: Option<[f64; 3]>,
+    forecast_told: bool,
 }
 
 impl Default for TerminalProgress {
@@ -35,6 +36,7 @@ impl Default for TerminalProgress {
             bar,
             phase: String::new(),
             error_mm: None,
+            forecast_told: false,
         }
     }
 }
@@ -79,6 +81,12 @@ impl Observer for TerminalProgress {
             feedback.stop_n,
             feedback.range_m,
         );
+        if let Some(forecast_mm) = feedback.forecast_mm.filter(|_| !self.forecast_told) {
+            self.forecast_told = true;
+            self.line(&format!(
+                "forecast   placements on targets seen like this end within {forecast_mm:.0} mm (95 %)"
+            ));
+        }
         match feedback.score {
             Some(score) => self.line(&format!("{text}, correlation {score:.2}")),
             None => self.bar.set_message(text),

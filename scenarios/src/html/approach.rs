@@ -100,11 +100,14 @@ pub(super) fn approach(report: &RunReport, evidence: &Evidence) -> Result<String
         let _ = write!(
             out,
             "<p>{:.2} m driven in {} stops; handed over from the mast to the pair <b>{}</b> within \
-             {:.2} px of the place that geometry predicts.</p><div class=\"charts\">{charts}</div>",
+             {:.2} px of the place that geometry predicts. Before the drive the error along the \
+             surface was forecast to stay below <b>{:.0} mm</b> (95 %).</p>\
+             <div class=\"charts\">{charts}</div>",
             a.driven_m,
             a.stops.len(),
             escape(&a.target.pair),
             a.handover_px,
+            a.forecast_mm,
         );
         for earlier in &a.earlier {
             let [x, y, _] = earlier.position_m;

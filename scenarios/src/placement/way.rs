@@ -126,8 +126,14 @@ impl Mission<'_> {
         mut goal: DriveToGoal,
         most_n: u32,
     ) -> Result<(), Fault> {
+        let mut driven_m = 0.0;
         loop {
-            let reached = self.drive_to(goal.clone()).await?;
+            let mut reached = self.drive_to(goal.clone()).await?;
+            if let Some(limit_m) = &mut goal.limits.max_distance_m {
+                *limit_m = (*limit_m - reached.driven_m).max(0.0);
+            }
+            driven_m += reached.driven_m;
+            reached.driven_m = driven_m;
             record.approach = Some(reached.clone());
             record.waypoints = self.waypoints(&reached).await?;
             let Err(fault) = self.place_from_here(record, &reached.target).await else {
@@ -144,9 +150,6 @@ impl Mission<'_> {
             goal.anchor = reached.tracked_in;
             if let Some(stop) = reached.stops.last() {
                 goal.target.position_m = Point::from(Vector3::from(stop.position_m));
-            }
-            if let Some(limit_m) = &mut goal.limits.max_distance_m {
-                *limit_m = (*limit_m - reached.driven_m).max(0.0);
             }
         }
     }

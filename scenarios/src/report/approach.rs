@@ -17,6 +17,8 @@ pub struct ApproachReport {
     pub driven_m: f64,
     /// Every stop.
     pub stops: Vec<StopReport>,
+    /// Error along the surface that was forecast before the drive, 95 %, mm.
+    pub forecast_mm: f64,
     /// The target in the left mast image, as it was handed over, px.
     pub tracked_px: [f64; 2],
     /// Distance between the pixel that geometry predicts in the body pair and the matched one, px.
@@ -148,6 +150,7 @@ impl ApproachReport {
         Self {
             driven_m: r.driven_m,
             stops: r.stops.iter().map(stop).collect(),
+            forecast_mm: r.forecast_mm,
             tracked_px: r.tracked_px,
             handover_px: r.handover_px,
             spot_offset_mm: r.spot_offset_m.map(|d| d.map(|x| x * 1e3)),

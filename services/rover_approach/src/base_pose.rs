@@ -338,19 +338,27 @@ impl BaseTask<'_> {
     }
 
     /// Distance of the arm from the tangent plane at the target, near the target, and from the
-    /// ground on which the rover stands, m; `spot` in the rover's frame. The last link is left
-    /// out: it is to go there. None for joint angles that are none of this arm.
+    /// ground on which the rover stands, m; `spot` in the rover's frame. Of the last link the tool
+    /// is left out, which is to go there, and the rest may come nearer, which counts as more. None
+    /// for joint angles that are none of this arm.
     fn room_m(&self, spot: &TargetSpot, joints_rad: &[f64]) -> Option<f64> {
         /// Farther aside the surface is another one, m.
         const NEAR_M: f64 = 0.25;
         /// Places looked at on each shape.
         const PLACES: u32 = 5;
+        /// Part of the last link about its tip that may touch, m.
+        const TOOL_M: f64 = 0.12;
+        /// How much nearer the rest of the last link may come.
+        const NEARER: f64 = 3.0;
         let robot = self.robot;
         let frames = robot.arm.link_poses(joints_rad).ok()?;
         let joints = &robot.description().arm.joints;
         let mut room_m = f64::INFINITY;
-        let links = frames.iter().skip(1).zip(joints);
-        for (frame, joint) in links.take(joints.len().saturating_sub(1)).skip(1) {
+        let (tip, _) = robot.tool.at(&robot.arm, joints_rad).ok()?;
+        let tip = (robot.rover_from_arm_base.isometry * Point3::from(tip)).coords;
+        let links = frames.iter().skip(1).zip(joints).enumerate();
+        for (link, (frame, joint)) in links.skip(1) {
+            let is_last = link + 1 == joints.len();
             let rover_from_link = robot.rover_from_arm_base.isometry * frame;
             for shape in &joint.shape {
                 let [a, b] = [shape.from_m, shape.to_m].map(Vector3::from);
@@ -358,11 +366,16 @@ impl BaseTask<'_> {
                     let part = f64::from(k) / f64::from(PLACES - 1);
                     let place = (rover_from_link * Point3::from(a + (b - a) * part)).coords;
                     let away = place - spot.position_m;
-                    let above = away.dot(&spot.normal);
-                    if (away - spot.normal * above).norm() < NEAR_M {
-                        room_m = room_m.min(above - shape.radius_m);
+                    let above_m = away.dot(&spot.normal);
+                    if is_last && (place - tip).norm() < TOOL_M {
+                        continue;
                     }
-                    room_m = room_m.min(place.z - shape.radius_m);
+                    let mut least_m = place.z;
+                    if (away - spot.normal * above_m).norm() < NEAR_M {
+                        least_m = least_m.min(above_m);
+                    }
+                    let weight = if is_last { NEARER } else { 1.0 };
+                    room_m = room_m.min((least_m - shape.radius_m) * weight);
                 }
             }
         }
@@ -488,6 +501,15 @@ mod tests {
     }
 
     fn choose(target: [f64; 3], normal: [f64; 3], map: &GroundMap) -> Result<BaseChoice, NoBase> {
+        choose_another(target, normal, map, Vec::new())
+    }
+
+    fn choose_another(
+        target: [f64; 3],
+        normal: [f64; 3],
+        map: &GroundMap,
+        avoid: Vec<PlanarPose>,
+    ) -> Result<BaseChoice, NoBase> {
         let robot = robot();
         let task = BaseTask {
             robot: &robot,
@@ -496,7 +518,7 @@ mod tests {
             rules: &BaseRules::default(),
             shade: &Shade::of(&robot, robot.posture("stow").unwrap()),
             sun: None,
-            avoid: Vec::new(),
+            avoid,
         };
         let spot = TargetSpot {
             position_m: target.into(),
@@ -517,6 +539,38 @@ mod tests {
             }
         }
         choice
+    }
+
+    #[test]
+    fn a_pose_tried_in_vain_and_all_like_it_are_not_chosen_again() {
+        let flat = ground(|_, _| 0.0);
+        let (target, normal) = ([2.2, 0.1, 0.0], [0.0, 0.0, 1.0]);
+        let tried = choose(target, normal, &flat).unwrap().serving[0].pose;
+        let again = choose_another(target, normal, &flat, vec![tried]).unwrap();
+        assert!(again.refused["tried_before"] > 0);
+        for s in &again.serving {
+            let away_m = (s.pose.x_m - tried.x_m).hypot(s.pose.y_m - tried.y_m);
+            let turned_rad = (s.pose.heading_rad - tried.heading_rad).abs();
+            assert!(away_m >= 0.2 || turned_rad >= 0.3, "{s:?}");
+        }
+    }
+
+    #[test]
+    fn the_arm_that_serves_keeps_off_the_ground_but_for_its_tool() {
+        let choice = choose([2.2, 0.1, 0.0], [0.0, 0.0, 1.0], &ground(|_, _| 0.0)).unwrap();
+        let robot = robot();
+        for s in choice.serving.iter().step_by(5) {
+            let frames = robot.arm.link_poses(&s.joints_rad).unwrap();
+            let joints = &robot.description().arm.joints;
+            for (frame, joint) in frames.iter().skip(1).zip(joints).take(4).skip(1) {
+                for shape in &joint.shape {
+                    for end in [shape.from_m, shape.to_m] {
+                        let at = robot.rover_from_arm_base.isometry * frame * Point3::from(end);
+                        assert!(at.z >= shape.radius_m, "{at} {shape:?}");
+                    }
+                }
+            }
+        }
     }
 
     #[test]

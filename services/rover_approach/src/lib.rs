@@ -11,11 +11,13 @@
 #![allow(clippy::neg_cmp_op_on_partial_ord)]
 
 pub mod align;
+pub mod anchor;
 pub mod base_pose;
 pub mod drive;
 pub mod error;
 pub mod filter;
 pub mod first_ray;
+pub mod fix;
 pub mod handover;
 #[cfg(feature = "bus")]
 mod hardware;

@@ -1,9 +1,9 @@
 //! What an approach tells of itself: sightings, and the error of the position by source.
 
 use crate::first_ray::FirstRayFix;
+use crate::fix::{Attempt, Fix, Refusal};
 use crate::handover::Handover;
 use crate::surface::StereoPlane;
-use crate::track::{Attempt, Fix, Refusal};
 use nalgebra::{Matrix2, Matrix3, Vector2};
 use rover_messages::approach::{ErrorShare, Sighting};
 use rover_messages::imaging::FrameReference;
@@ -28,6 +28,7 @@ pub(crate) fn sighting(
         _ if new_image => "new_image",
         Some(Attempt::Translation) => "translation",
         Some(Attempt::PreviousAnchor) => "second_anchor",
+        Some(Attempt::LastStop) => "last_stop",
         Some(Attempt::Affine) | None => "affine",
     };
     let predicted = predicted_px.or(fix.map(|f| f.pixel_px - f.innovation_px));
@@ -59,6 +60,11 @@ const RELIEF_REST: f64 = 0.5;
 /// Smallest error of one match that is claimed, px.
 const MATCH_FLOOR_PX: f64 = 0.05;
 
+/// 95 % of the losses of tracking, px of the image in which the target was named.
+const FORECAST_PX: f64 = 0.9;
+/// 95 % of the errors of hand-over, servo and contact together, mm.
+const FORECAST_ARM_MM: f64 = 3.0;
+
 /// Metres along the surface of one pixel at a surface, along its flattest direction.
 fn metres_per_px(surface: &StereoPlane, focal_px: f64) -> f64 {
     let n = &surface.plane.normal;
@@ -80,10 +86,18 @@ impl Budget {
         }
     }
 
+    /// Error along the surface that 95 % of placements stay below, mm, as it can be told from the
+    /// image in which the target was named: what tracking loses over an approach is so many of
+    /// that image's pixels, whatever the range, and a pixel of a surface seen flat covers much.
+    pub fn forecast_mm(&self) -> f64 {
+        let metres_per_px = (12.0 * self.designation).sqrt();
+        (FORECAST_PX * metres_per_px * 1e3).hypot(FORECAST_ARM_MM)
+    }
+
     /// One more match against an anchor; only where a new anchor is made does its error stay.
     pub fn tracked(&mut self, fix: &Fix, focal_px: f64) {
         let scale = metres_per_px(&fix.surface, focal_px);
-        if fix.anchored {
+        if fix.anchored || fix.attempt == Attempt::LastStop {
             self.tracking += (fix.sigma_px.max(MATCH_FLOOR_PX) * scale).powi(2);
             self.relief += (RELIEF_REST * fix.relief_px.norm() * scale).powi(2);
         }

@@ -2,17 +2,19 @@
 
 mod near;
 
+use crate::anchor::TrackRules;
 use crate::base_pose::{BaseChoice, Serving, TargetSpot};
 use crate::drive::{DriveRules, next_movement};
 use crate::filter::{Motion, TargetEstimate};
 use crate::first_ray::{FirstRayRules, first_ray};
+use crate::fix::{Fix, Refusal};
 use crate::handover::{HandoverRules, hand_over};
 use crate::hardware::{Frame, Hardware, Light, fault};
 use crate::obstacles::{GroundMap, GroundRules, PlanarPose};
 use crate::report::{Budget, sighting, sigma_mm};
 use crate::service::unfit;
 use crate::shade::Shade;
-use crate::track::{Fix, Refusal, TrackRules, Tracker};
+use crate::track::Tracker;
 use nalgebra::{Isometry3, Matrix3, Point3, UnitQuaternion, Vector2, Vector3};
 use near::NearStep;
 use rover_geometry::{Point, tangent_basis};
@@ -37,7 +39,7 @@ const STANDOFF_M: f64 = 1.1;
 /// Where the ground is looked at before each movement, m ahead.
 const HAZARD_LOOK_M: f64 = 2.0;
 /// Pixels between the points of the ground map.
-const MAP_STEP_PX: u32 = 16;
+const MAP_STEP_PX: u32 = 20;
 /// What the mast sees so near to the rover is the rover itself, m.
 const OWN_M: f64 = 0.08;
 /// Frames whose points are kept.
@@ -70,6 +72,8 @@ pub(crate) struct Session<'a> {
     ground: Vec<Vec<Vector3<f64>>>,
     stops: Vec<ApproachStop>,
     budget: Budget,
+    /// Told before the drive, mm.
+    forecast_mm: f64,
     driven_m: f64,
     spot_offset_m: Option<Vector3<f64>>,
     near_moves_n: u32,
@@ -129,6 +133,7 @@ impl<'a> Session<'a> {
             rules.max_slope_rad = slope;
         }
         let focal_px = now.view.cameras.left.model.cahv()[2].norm();
+        let budget = Budget::designated(surface, focal_px);
         let mut session = Self {
             hardware,
             goal,
@@ -136,7 +141,8 @@ impl<'a> Session<'a> {
             mast,
             mobility,
             rules,
-            budget: Budget::designated(surface, focal_px),
+            forecast_mm: budget.forecast_mm(),
+            budget,
             tracker,
             estimate,
             now,
@@ -413,6 +419,7 @@ impl<'a> Session<'a> {
             target,
             spot_offset_m: self.spot_offset_m.map(Into::into),
             budget: self.budget.shares(),
+            forecast_mm: self.forecast_mm,
             tracked_px,
             tracked_in: self.now.reference.clone(),
             handover_px: (found.pixel_px - found.geometric_px).norm(),
@@ -597,6 +604,7 @@ impl<'a> Session<'a> {
             pixel_px: None,
             sigma_mm: sigma_mm(&self.estimate.covariance_m2),
             score: None,
+            forecast_mm: Some(self.forecast_mm),
         }
     }
 }

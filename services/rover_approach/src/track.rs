@@ -5,163 +5,17 @@
 //! of the prediction, aligned to subpixel, and put onto the plane that stereo sees now. When the
 //! range has shrunk enough the target is anchored anew, after the relief correction.
 
-use crate::align::{AlignRules, Freedom, Template, refine, search};
+use crate::align::{Freedom, Template, refine, search};
+use crate::anchor::{Anchor, TrackRules, anchor, reach};
 use crate::error::TrackError;
+use crate::fix::{Attempt, Fix, Refusal};
 use crate::own_shadow::lit_alike;
-use crate::patch::HalfSize;
-use crate::relief::{AnchorGeometry, ReliefRules, corrected_pixel};
-use crate::surface::{PlaneRules, StereoPlane, SurfacePlane, measure_plane};
+use crate::relief::{AnchorGeometry, corrected_pixel};
+use crate::surface::{StereoPlane, measure_plane};
 use crate::view::View;
 use crate::warp::PlaneWarp;
 use nalgebra::{Isometry3, Matrix2, Point3, Vector2};
 use std::{borrow::Cow, sync::Arc};
-
-/// How the target is tracked.
-#[derive(Clone, Debug, PartialEq)]
-pub struct TrackRules {
-    /// Half side of the template, px; flattened by the foreshortening, never below
-    /// [`Self::min_half_px`].
-    pub half_px: usize,
-    /// Smallest half side, px.
-    pub min_half_px: usize,
-    /// Anchor anew when the anchor's range is so many times the present one.
-    pub anchor_ratio: f64,
-    /// Anchor anew when the target is seen from a direction that differs so much, rad.
-    pub anchor_turn_rad: f64,
-    /// Least weighted correlation of an accepted match.
-    pub min_score: f64,
-    /// Farthest that tracking back may end from the anchor pixel, anchor px.
-    pub max_back_px: f64,
-    /// Search reach in standard deviations of the prediction.
-    pub search_sigma: f64,
-    /// Least correlation of the template's own stereo match: less is no plane.
-    pub min_plane_score: f64,
-    /// Least correlation in the search.
-    pub min_search_score: f64,
-    /// Bounds of the alignment.
-    pub align: AlignRules,
-    /// How planes are measured.
-    pub plane: PlaneRules,
-    /// How the relief is measured; none: no relief correction.
-    pub relief: Option<ReliefRules>,
-}
-
-impl Default for TrackRules {
-    fn default() -> Self {
-        Self {
-            half_px: 12,
-            min_half_px: 7,
-            anchor_ratio: 1.4,
-            anchor_turn_rad: 0.25,
-            min_score: 0.80,
-            max_back_px: 0.85,
-            search_sigma: 3.5,
-            min_plane_score: 0.5,
-            min_search_score: 0.4,
-            align: AlignRules::default(),
-            plane: PlaneRules::default(),
-            relief: Some(ReliefRules::default()),
-        }
-    }
-}
-
-/// A place in an image at which the target was anchored.
-#[derive(Clone, Debug)]
-pub struct Anchor {
-    /// The view it was anchored in.
-    pub view: Arc<View>,
-    /// The target's pixel there.
-    pub pixel_px: Vector2<f64>,
-    /// Range then, m.
-    pub range_m: f64,
-    /// The template.
-    pub template: Template,
-    /// The template's warp, present rover frame.
-    pub warp: PlaneWarp,
-    /// Present rover frame to that of the view, as odometry and matches say.
-    pub anchor_from_rover: Isometry3<f64>,
-}
-
-/// How a fix was obtained.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Attempt {
-    /// Translation, then affine.
-    Affine,
-    /// Translation only.
-    Translation,
-    /// With the anchor before the last one.
-    PreviousAnchor,
-}
-
-/// The target found again.
-#[derive(Clone, Debug)]
-pub struct Fix {
-    /// Pixel in the left image.
-    pub pixel_px: Vector2<f64>,
-    /// Surface there, from stereo.
-    pub surface: StereoPlane,
-    /// Weighted correlation with the anchor.
-    pub score: f64,
-    /// Best correlation elsewhere in the search.
-    pub second_score: f64,
-    /// How far tracking back ends from the anchor pixel, anchor px.
-    pub back_px: f64,
-    /// Distance from the prediction, px.
-    pub innovation_px: Vector2<f64>,
-    /// That distance in standard deviations of the prediction.
-    pub innovation_sigma: f64,
-    /// Standard deviation of the pixel, px.
-    pub sigma_px: f64,
-    /// What succeeded.
-    pub attempt: Attempt,
-    /// Whether the target was anchored anew here.
-    pub anchored: bool,
-    /// Move of the hit by the relief correction, px.
-    pub relief_px: Vector2<f64>,
-}
-
-/// A stop at which the target was not found: every attempt with its reason.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Refusal {
-    /// Attempts in order.
-    pub attempts: Vec<(Attempt, TrackError)>,
-}
-
-impl std::fmt::Display for Refusal {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        for (i, (attempt, error)) in self.attempts.iter().enumerate() {
-            let separator = if i == 0 { "" } else { "; " };
-            let name = match attempt {
-                Attempt::Affine => "affine",
-                Attempt::Translation => "translation only",
-                Attempt::PreviousAnchor => "previous anchor",
-            };
-            write!(f, "{separator}{name}: {error}")?;
-        }
-        Ok(())
-    }
-}
-
-impl Refusal {
-    /// Of a target that the rover itself hides: nothing was attempted, because what is seen there
-    /// is not the target.
-    #[must_use]
-    pub fn hidden() -> Self {
-        Self {
-            attempts: vec![(Attempt::Affine, TrackError::Hidden)],
-        }
-    }
-
-    /// Whether the rover's own body or shadow was in the way of an attempt.
-    #[must_use]
-    pub fn by_the_rover(&self) -> bool {
-        self.attempts
-            .iter()
-            .any(|(_, e)| matches!(e, TrackError::OwnShadow { .. } | TrackError::Hidden))
-    }
-}
-
-impl std::error::Error for Refusal {}
 
 /// Keeps a target through the stops of an approach.
 #[derive(Clone, Debug)]
@@ -170,6 +24,8 @@ pub struct Tracker {
     first: Anchor,
     /// Newest last; at most two.
     anchors: Vec<Anchor>,
+    /// The target as found at the last stop, where that made no anchor.
+    last_stop: Option<Anchor>,
     pixel_px: Vector2<f64>,
     surface: StereoPlane,
 }
@@ -208,6 +64,7 @@ impl Tracker {
         Ok(Self {
             rules,
             anchors: vec![first.clone()],
+            last_stop: None,
             first,
             pixel_px,
             surface,
@@ -288,7 +145,33 @@ impl Tracker {
                 Err(error) => attempts.push((attempt, error)),
             }
         }
+        if let Some(last) = self.last_stop.clone() {
+            let before = self.anchors.clone();
+            let index = self.push(last);
+            match self.attempt(view, now_from_last, prediction_px2, index, Freedom::Affine) {
+                Ok(found) => {
+                    return Ok(self.accept(
+                        view,
+                        now_from_last,
+                        prediction_px2,
+                        (Attempt::LastStop, index, found),
+                        last_stop,
+                    ));
+                }
+                Err(error) => attempts.push((Attempt::LastStop, error)),
+            }
+            self.anchors = before;
+        }
         Err(Refusal { attempts })
+    }
+
+    /// Keeps an anchor as the newest, and its index.
+    fn push(&mut self, anchor: Anchor) -> usize {
+        self.anchors.push(anchor);
+        if self.anchors.len() > 2 {
+            self.anchors.remove(0);
+        }
+        self.anchors.len() - 1
     }
 
     fn attempt(
@@ -479,6 +362,7 @@ impl Tracker {
         carry(&mut self.first);
         self.anchors.iter_mut().for_each(carry);
         self.anchors[index].warp = found.warp;
+        self.last_stop = None;
         self.pixel_px = found.pixel_px;
         self.surface = found.surface;
         let shrunk = self.anchors[index].range_m / found.surface.range_m >= self.rules.anchor_ratio;
@@ -490,12 +374,13 @@ impl Tracker {
                 relief_px = moved.0 - self.pixel_px;
                 (self.pixel_px, self.surface) = moved;
             }
-            if let Ok(new) = anchor(Arc::clone(view), self.pixel_px, &self.surface, &self.rules) {
+        }
+        if let Ok(new) = anchor(Arc::clone(view), self.pixel_px, &self.surface, &self.rules) {
+            if shrunk || turned || last_stop {
                 anchored = true;
-                self.anchors.push(new);
-                if self.anchors.len() > 2 {
-                    self.anchors.remove(0);
-                }
+                self.push(new);
+            } else {
+                self.last_stop = Some(new);
             }
         }
         Fix {
@@ -530,7 +415,10 @@ impl Tracker {
             anchor.warp = anchor.warp.moved(now_from_last);
         };
         carry(&mut self.first);
-        self.anchors.iter_mut().for_each(carry);
+        self.anchors
+            .iter_mut()
+            .chain(&mut self.last_stop)
+            .for_each(carry);
         self.surface.plane = self.surface.plane.moved(now_from_last);
         let turn = now_from_last.rotation.to_rotation_matrix();
         self.surface.covariance_m2 = turn * self.surface.covariance_m2 * turn.transpose();
@@ -561,71 +449,8 @@ impl Tracker {
         let warp = self.newest().warp;
         let surface = self.plane_at(view, &pixel_px, &warp, &Isometry3::identity())?;
         let new = anchor(Arc::clone(view), pixel_px, &surface, &self.rules)?;
-        self.anchors.push(new);
-        if self.anchors.len() > 2 {
-            self.anchors.remove(0);
-        }
+        self.push(new);
         (self.pixel_px, self.surface) = (pixel_px, surface);
         Ok(())
-    }
-}
-
-/// Search reach in template px for a covariance in image px^2.
-fn reach(
-    footprint: &Matrix2<f64>,
-    prediction_px2: &Matrix2<f64>,
-    sigmas: f64,
-) -> Result<HalfSize, TrackError> {
-    /// Farther than this no template is searched.
-    const MAX_REACH: f64 = 160.0;
-    let inverse = footprint.try_inverse().ok_or(TrackError::NotVisible)?;
-    let spread = inverse * prediction_px2 * inverse.transpose();
-    let side = |k: usize| {
-        let sigma = spread[(k, k)].max(0.0).sqrt();
-        (sigmas * sigma + 2.0).ceil()
-    };
-    let (u, v) = (side(0), side(1));
-    if !(u.is_finite() && v.is_finite()) {
-        return Err(TrackError::BadInput {
-            what: "covariance of the prediction".into(),
-            found: format!("{prediction_px2}"),
-            expected: "finite numbers".into(),
-        });
-    }
-    Ok(HalfSize {
-        u: u.min(MAX_REACH) as usize,
-        v: v.min(MAX_REACH) as usize,
-    })
-}
-
-/// Anchors a target at a pixel of a view.
-fn anchor(
-    view: Arc<View>,
-    pixel_px: Vector2<f64>,
-    surface: &StereoPlane,
-    rules: &TrackRules,
-) -> Result<Anchor, TrackError> {
-    let camera = &view.cameras.left;
-    let half = window(camera.model.cahv()[0], &surface.plane, rules);
-    let template = Template::cut(&view.left, &pixel_px, half)?;
-    let warp = PlaneWarp::new(camera, &pixel_px, &surface.plane).ok_or(TrackError::NotVisible)?;
-    Ok(Anchor {
-        pixel_px,
-        range_m: surface.range_m,
-        template,
-        warp,
-        anchor_from_rover: Isometry3::identity(),
-        view,
-    })
-}
-
-/// The template's half sizes: flattened by the foreshortening.
-fn window(eye: &nalgebra::Vector3<f64>, plane: &SurfacePlane, rules: &TrackRules) -> HalfSize {
-    let sight = (eye - plane.point).normalize();
-    let cosine = plane.normal.dot(&sight).clamp(0.0, 1.0);
-    let v = (rules.half_px as f64 * cosine.sqrt()).round() as usize;
-    HalfSize {
-        u: rules.half_px,
-        v: v.max(rules.min_half_px),
     }
 }

@@ -4,9 +4,9 @@
 use nalgebra::{Isometry3, Matrix2, Point3, UnitQuaternion, Vector2, Vector3};
 use rover_approach::handover::{HandoverRules, hand_over};
 use rover_approach::surface::SurfacePlane;
-use rover_approach::track::{TrackRules, Tracker};
 use rover_approach::view::View;
 use rover_approach::warp::PlaneWarp;
+use rover_approach::{anchor::TrackRules, track::Tracker};
 use rover_cameras::{Cahv, Camera, CameraModel, StereoPair};
 use rover_vision::{Image8, PreparedImage};
 use std::sync::Arc;

@@ -1,6 +1,7 @@
 //! Points on a grid over the whole image, for obstacle maps.
 
 use nalgebra::{Vector2, Vector3};
+use rayon::prelude::*;
 use rover_cameras::StereoPair;
 
 use super::matching::{check_input, match_checked};
@@ -39,17 +40,16 @@ pub fn sparse_points(
             .collect()
     };
     let (columns, rows) = (places(left.width_px), places(left.height_px));
-    let mut ranges: Vec<Option<f64>> = Vec::with_capacity(columns.len() * rows.len());
-    for &v in &rows {
-        for &u in &columns {
-            let pixel = Vector2::new(f64::from(u), f64::from(v));
-            ranges.push(
-                match_checked(left, right, pair, &pixel, rules)
-                    .ok()
-                    .map(|m| m.range_m),
-            );
-        }
-    }
+    let range_at = |u: u32, v: u32| {
+        let pixel = Vector2::new(f64::from(u), f64::from(v));
+        let found = match_checked(left, right, pair, &pixel, rules).ok()?;
+        Some(found.range_m)
+    };
+    let ranges: Vec<Option<f64>> = rows
+        .par_iter()
+        .flat_map_iter(|&v| columns.iter().map(move |&u| (u, v)))
+        .map(|(u, v)| range_at(u, v))
+        .collect();
     let at = |i: isize, j: isize| -> Option<f64> {
         let inside = i >= 0 && j >= 0 && (i as usize) < columns.len() && (j as usize) < rows.len();
         if inside {

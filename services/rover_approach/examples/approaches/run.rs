@@ -8,7 +8,7 @@ use rand_distr::{Distribution, StandardNormal};
 use rover_approach::filter::{OdometryModel, TargetEstimate};
 use rover_approach::first_ray::{FirstRayRules, first_ray};
 use rover_approach::handover::{HandoverRules, hand_over};
-use rover_approach::track::{TrackRules, Tracker};
+use rover_approach::{anchor::TrackRules, track::Tracker};
 use std::sync::Arc;
 
 /// How a run goes.
