@@ -2,6 +2,7 @@
 
 use crate::align::{AlignRules, Template};
 use crate::error::TrackError;
+use crate::fix::Attempt;
 use crate::patch::HalfSize;
 use crate::relief::ReliefRules;
 use crate::surface::{PlaneRules, StereoPlane, SurfacePlane};
@@ -22,8 +23,11 @@ pub struct TrackRules {
     pub anchor_ratio: f64,
     /// Anchor anew when the target is seen from a direction that differs so much, rad.
     pub anchor_turn_rad: f64,
-    /// Least weighted correlation of an accepted match.
-    pub min_score: f64,
+    /// What a match must fulfil.
+    pub gate: Gate,
+    /// What it must fulfil where the first attempt, with the newest anchor and an affine
+    /// correction, has failed: what is left then to be found may as well be something else.
+    pub strict_gate: Gate,
     /// Farthest that tracking back may end from the anchor pixel, anchor px.
     pub max_back_px: f64,
     /// Search reach in standard deviations of the prediction.
@@ -47,7 +51,16 @@ impl Default for TrackRules {
             min_half_px: 7,
             anchor_ratio: 1.4,
             anchor_turn_rad: 0.25,
-            min_score: 0.80,
+            gate: Gate {
+                min_score: 0.80,
+                min_margin: 0.02,
+                max_innovation_sigma: 8.0,
+            },
+            strict_gate: Gate {
+                min_score: 0.80,
+                min_margin: 0.10,
+                max_innovation_sigma: 2.5,
+            },
             max_back_px: 0.85,
             search_sigma: 3.5,
             min_plane_score: 0.5,
@@ -55,6 +68,28 @@ impl Default for TrackRules {
             align: AlignRules::default(),
             plane: PlaneRules::default(),
             relief: Some(ReliefRules::default()),
+        }
+    }
+}
+
+/// What a match must fulfil to be taken for the target.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Gate {
+    /// Least weighted correlation after the alignment.
+    pub min_score: f64,
+    /// By how much the best correlation of the search must exceed the best one elsewhere.
+    pub min_margin: f64,
+    /// Farthest from the prediction, standard deviations.
+    pub max_innovation_sigma: f64,
+}
+
+impl TrackRules {
+    /// The gate of an attempt.
+    #[must_use]
+    pub fn gate(&self, attempt: Attempt) -> Gate {
+        match attempt {
+            Attempt::Affine => self.gate,
+            _ => self.strict_gate,
         }
     }
 }

@@ -90,6 +90,30 @@ pub enum TrackError {
         /// Limit, px.
         limit_px: f64,
     },
+    /// Another place of the search looks as much like the target.
+    #[error(
+        "correlation {score:.3}, and {second_score:.3} elsewhere in the search, need {margin} more"
+    )]
+    NotUnique {
+        /// Best correlation of the search.
+        score: f64,
+        /// Best correlation elsewhere.
+        second_score: f64,
+        /// Least difference.
+        margin: f64,
+    },
+    /// A match too far from where the target was expected.
+    #[error(
+        "the match lies {distance_px:.1} px from where it was expected, {sigmas:.1} standard deviations, limit {limit}"
+    )]
+    Unexpected {
+        /// Distance, px.
+        distance_px: f64,
+        /// The same in standard deviations.
+        sigmas: f64,
+        /// Limit.
+        limit: f64,
+    },
     /// A part of the rover is in the line of sight.
     #[error("the rover's own body is between the camera and the target")]
     Hidden,

@@ -1,55 +1,44 @@
 //! One approach from designation to hand-over, as a sequence of stops.
 
+mod finish;
+mod ground;
 mod near;
 
 use crate::anchor::TrackRules;
-use crate::base_pose::{BaseChoice, Serving, TargetSpot};
 use crate::drive::{DriveRules, next_movement};
 use crate::filter::{Motion, TargetEstimate};
-use crate::first_ray::{FirstRayRules, first_ray};
 use crate::fix::{Fix, Refusal};
-use crate::handover::{HandoverRules, hand_over};
 use crate::hardware::{Frame, Hardware, Light, fault};
-use crate::obstacles::{GroundMap, GroundRules, PlanarPose};
+use crate::obstacles::PlanarPose;
 use crate::report::{Budget, sighting, sigma_mm};
 use crate::service::unfit;
 use crate::shade::Shade;
 use crate::track::Tracker;
-use nalgebra::{Isometry3, Matrix3, Point3, UnitQuaternion, Vector2, Vector3};
+use finish::Finish;
+use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector2, Vector3};
 use near::NearStep;
-use rover_geometry::{Point, tangent_basis};
+use rover_geometry::Point;
 use rover_messages::{
     Fault,
     approach::{
-        ApproachActivity, ApproachStop, BasePose, DriveToFeedback, DriveToGoal, DriveToResult,
-        Sighting,
+        ApproachActivity, ApproachStop, DriveToFeedback, DriveToGoal, DriveToResult, Sighting,
     },
     mobility::{DriveArc, DriveResult, WheelsState},
     status::work,
-    target::Target,
 };
 use rover_robot::{MastDescription, MobilityDescription, Robot};
-use rover_vision::{MatchRules, sparse_points};
 use std::sync::Arc;
 
 /// Range at which the base pose is chosen, m along the ground.
 const NEAR_M: f64 = 3.2;
 /// Distance from the target that is aimed at before, m.
 const STANDOFF_M: f64 = 1.1;
-/// Where the ground is looked at before each movement, m ahead.
-const HAZARD_LOOK_M: f64 = 2.0;
-/// Pixels between the points of the ground map.
-const MAP_STEP_PX: u32 = 20;
-/// What the mast sees so near to the rover is the rover itself, m.
-const OWN_M: f64 = 0.08;
-/// Frames whose points are kept.
-const MAP_FRAMES: usize = 6;
 /// A part of the rover that comes so near to the line of sight hides the target, m.
 const HIDING_M: f64 = 0.01;
 /// Most stops if the goal does not say.
 const MAX_STOPS_N: u32 = 60;
-/// Base poses that may be chosen anew after a look of the body cameras.
-const SECOND_CHOICES_N: u32 = 4;
+/// Movements back from where no way is clear, in one approach.
+const RETREATS_N: u32 = 3;
 /// Stops in a row at which the target may be missed.
 const MISSES_N: u32 = 1;
 /// The same while the rover's own body or the edge of its shadow passes over it.
@@ -77,6 +66,8 @@ pub(crate) struct Session<'a> {
     driven_m: f64,
     spot_offset_m: Option<Vector3<f64>>,
     near_moves_n: u32,
+    /// Movements back from where no way was clear.
+    retreats_n: u32,
     shade: Arc<Shade>,
     /// Stops in a row at which the target was not found.
     missed_n: u32,
@@ -86,13 +77,6 @@ pub(crate) struct Session<'a> {
     normal_in_site: Option<Vector3<f64>>,
     /// Base poses chosen anew after a look of the body cameras.
     second_choices_n: u32,
-}
-
-/// What came of a hand-over.
-enum Finish {
-    Reached(Box<DriveToResult>),
-    /// The target must be served from elsewhere.
-    Otherwise,
 }
 
 impl<'a> Session<'a> {
@@ -152,6 +136,7 @@ impl<'a> Session<'a> {
             driven_m: 0.0,
             spot_offset_m: None,
             near_moves_n: 0,
+            retreats_n: 0,
             shade,
             missed_n: 0,
             aim: None,
@@ -194,13 +179,23 @@ impl<'a> Session<'a> {
     }
 
     /// An arc towards a place in front of the target.
-    fn far_movement(&self, range_m: f64) -> Result<DriveArc, Fault> {
+    fn far_movement(&mut self, range_m: f64) -> Result<DriveArc, Fault> {
         let level = self.level_from_rover();
         let target = (level * Point3::from(self.estimate.position_m)).coords.xy();
         let goal = target * (1.0 - STANDOFF_M / target.norm());
-        next_movement(&goal, range_m, &self.map(), self.mobility, &self.rules)
-            .map(|m| m.arc)
-            .map_err(|blocked| fault("path_blocked", blocked.to_string()).with("range_m", range_m))
+        let map = self.map();
+        let blocked = match next_movement(&goal, range_m, &map, self.mobility, &self.rules) {
+            Ok(movement) => return Ok(movement.arc),
+            Err(blocked) => blocked,
+        };
+        // From farther back an arc may lead around what is in the way.
+        if self.retreats_n < RETREATS_N
+            && let Some(movement) = self.backwards(&map)
+        {
+            self.retreats_n += 1;
+            return Ok(movement.arc);
+        }
+        Err(fault("path_blocked", blocked.to_string()).with("range_m", range_m))
     }
 
     /// After a movement: where is the target now, and is everything within its limits?
@@ -360,131 +355,6 @@ impl<'a> Session<'a> {
         });
     }
 
-    /// First ray, hand-over, and the target as the body pair sees it.
-    async fn finish(&mut self, serving: Serving, choice: BaseChoice) -> Result<Finish, Fault> {
-        self.tell(ApproachActivity::HandingOver);
-        let view = Arc::clone(&self.now.view);
-        if self.spot_offset_m.is_none()
-            && let Ok(met) = first_ray(&self.tracker, &view, &FirstRayRules::default())
-            && met.sigma_m < self.budget.tracking_m()
-            && self.tracker.move_to(&view, met.pixel_px).is_ok()
-        {
-            self.budget.met(&met);
-        }
-        let body = self.hardware.capture("body", 0).await?;
-        let (pixel, surface) = self.tracker.target();
-        let tracked_px: [f64; 2] = (*pixel).into();
-        let focal_px = body.view.cameras.left.model.cahv()[2].norm();
-        let mount_rad = self
-            .robot
-            .description()
-            .model_quality
-            .angle_deg
-            .to_radians();
-        let rules = HandoverRules::for_mounts(mount_rad, focal_px);
-        let found = self
-            .hardware
-            .shell
-            .timed(work::VISION, || {
-                hand_over(&view, pixel, surface, &body.view, &rules)
-            })
-            .map_err(|e| fault("handover_failed", e.to_string()))?;
-        self.budget.handed(&found, focal_px);
-        let mut target = self.acceptable(&found.pixel_px, &found.surface).await?;
-        let spot = TargetSpot {
-            position_m: target.position_m.coords,
-            normal: target.normal.unit.into_inner(),
-        };
-        if let Err(reason) = self.served_from_here(&spot)? {
-            return self.otherwise(&target, &reason);
-        }
-        let lateral = self.budget.lateral_m();
-        let n = target.normal.unit.into_inner();
-        let spread = (Matrix3::identity() - n * n.transpose()) * (lateral * lateral);
-        for (i, row) in target.covariance_m2.iter_mut().enumerate() {
-            for (j, value) in row.iter_mut().enumerate() {
-                *value += spread[(i, j)];
-            }
-        }
-        let quality = [
-            ("manipulability", serving.manipulability),
-            ("joint_limit_margin_rad", serving.limit_rad),
-            ("fiducial_facing_rad", serving.facing_rad),
-            (
-                "tilt_rad",
-                self.wheels.pose.roll_rad.hypot(self.wheels.pose.pitch_rad),
-            ),
-        ];
-        Ok(Finish::Reached(Box::new(DriveToResult {
-            target,
-            spot_offset_m: self.spot_offset_m.map(Into::into),
-            budget: self.budget.shares(),
-            forecast_mm: self.forecast_mm,
-            tracked_px,
-            tracked_in: self.now.reference.clone(),
-            handover_px: (found.pixel_px - found.geometric_px).norm(),
-            base: BasePose {
-                pose: self.wheels.pose,
-                quality: quality.map(|(name, x)| (name.to_string(), x)).into(),
-                candidates_n: choice.candidates_n,
-                refused: choice.refused,
-            },
-            stops: self.stops.clone(),
-            driven_m: self.driven_m,
-        })))
-    }
-
-    /// From near the surface turned out to face another way than from afar, so that the arm cannot
-    /// serve it from here: the base pose is chosen once more.
-    fn otherwise(&mut self, target: &Target, reason: &str) -> Result<Finish, Fault> {
-        if self.second_choices_n >= SECOND_CHOICES_N {
-            let message = format!("as the body cameras see the target, it is not served: {reason}");
-            return Err(fault("no_base_pose", message));
-        }
-        self.second_choices_n += 1;
-        let site_from_rover = self.wheels.pose.site_from_rover().isometry;
-        self.normal_in_site = Some(site_from_rover.rotation * target.normal.unit.into_inner());
-        self.aim = None;
-        Ok(Finish::Otherwise)
-    }
-
-    /// The target at the handed-over pixel; if the surface there is refused, a spot near it that is
-    /// not, within the goal's radius.
-    async fn acceptable(
-        &mut self,
-        pixel_px: &Vector2<f64>,
-        surface: &crate::surface::StereoPlane,
-    ) -> Result<Target, Fault> {
-        let refusal = match self.hardware.select("body", (*pixel_px).into()).await {
-            Ok(target) => return Ok(target),
-            Err(refusal) => refusal,
-        };
-        let radius_m = self.goal.spot_radius_m;
-        let Some(unit) = nalgebra::Unit::try_new(surface.plane.normal, 1e-9) else {
-            return Err(refusal);
-        };
-        if radius_m <= 0.0 {
-            return Err(refusal);
-        }
-        let (a, b) = tangent_basis(&unit);
-        let pair = self.robot.pair("body").map_err(|e| unfit(&e))?;
-        for part in [0.5, 1.0] {
-            for k in 0..8 {
-                let angle = f64::from(k) * std::f64::consts::FRAC_PI_4;
-                let offset = (a * angle.cos() + b * angle.sin()) * (part * radius_m);
-                let Ok(pixel) = pair.cameras.left.project(&(surface.plane.point + offset)) else {
-                    continue;
-                };
-                if let Ok(target) = self.hardware.select("body", pixel.into()).await {
-                    let moved = target.position_m.coords - surface.plane.point;
-                    self.spot_offset_m = Some(self.spot_offset_m.unwrap_or_default() + moved);
-                    return Ok(target);
-                }
-            }
-        }
-        Err(refusal)
-    }
-
     async fn point_at(&self, place: &Vector3<f64>) -> Result<(), Fault> {
         let angles = self.mast.angles_towards(&Point::from(*place));
         let [pan, tilt] = angles.ok_or_else(|| {
@@ -499,73 +369,6 @@ impl<'a> Session<'a> {
             within(tilt, self.mast.tilt_rad),
         ];
         self.hardware.point(pan_rad, tilt_rad).await
-    }
-
-    /// Looks at the ground that the next movement leads over, unless the target's own image shows
-    /// it.
-    async fn look_ahead(&mut self) -> Result<(), Fault> {
-        self.tell(ApproachActivity::Looking);
-        let bearing = self.estimate.position_m.xy().normalize();
-        let range_m = self.estimate.position_m.xy().norm();
-        if range_m < HAZARD_LOOK_M {
-            return Ok(());
-        }
-        let place = bearing * HAZARD_LOOK_M;
-        self.point_at(&Vector3::new(place.x, place.y, 0.0)).await?;
-        let frame = self.hardware.capture(&self.goal.target.pair, 0).await?;
-        self.remember(&frame);
-        Ok(())
-    }
-
-    fn remember_ground(&mut self) {
-        let frame = self.now.clone();
-        self.remember(&frame);
-    }
-
-    /// Adds a frame's points to the ground known; those of old frames are forgotten.
-    fn remember(&mut self, frame: &Frame) {
-        let Some(site_from_rover) = frame.frame.site_from_rover() else {
-            return;
-        };
-        let view = &frame.view;
-        let rules = MatchRules {
-            range_min_m: 0.9,
-            range_max_m: 8.0,
-            ..MatchRules::default()
-        };
-        let points = self.hardware.shell.timed(work::VISION, || {
-            sparse_points(&view.left, &view.right, &view.cameras, MAP_STEP_PX, &rules)
-        });
-        let Ok(points) = points else { return };
-        let [half_x, half_y] = self.mobility.footprint_half_m;
-        let own = |p: &Vector3<f64>| {
-            let below = p.x.abs() < half_x + OWN_M && p.y.abs() < half_y + OWN_M;
-            below || self.shade.touches(p, OWN_M)
-        };
-        let in_site = points
-            .iter()
-            .filter(|(_, p)| !own(p))
-            .map(|(_, p)| (site_from_rover.isometry * Point3::from(*p)).coords)
-            .collect();
-        self.ground.push(in_site);
-        if self.ground.len() > MAP_FRAMES {
-            self.ground.remove(0);
-        }
-    }
-
-    /// The ground known, in the levelled rover frame.
-    fn map(&self) -> GroundMap {
-        let pose = &self.wheels.pose;
-        let turn = UnitQuaternion::from_euler_angles(0.0, 0.0, pose.heading_rad);
-        let site_from_level = Isometry3::from_parts(pose.position_m.coords.into(), turn);
-        let level_from_site = site_from_level.inverse();
-        let points: Vec<Vector3<f64>> = self
-            .ground
-            .iter()
-            .flatten()
-            .map(|p| (level_from_site * Point3::from(*p)).coords)
-            .collect();
-        GroundMap::from_points(&points, GroundRules::default())
     }
 
     /// The rover frame without roll and pitch, from the rover frame.

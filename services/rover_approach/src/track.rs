@@ -37,8 +37,20 @@ struct Candidate {
     surface: StereoPlane,
     score: f64,
     second_score: f64,
+    innovation_px: Vector2<f64>,
+    innovation_sigma: f64,
     back_px: f64,
     sigma_px: f64,
+}
+
+/// What is looked for at a stop.
+struct Sought<'a> {
+    view: &'a Arc<View>,
+    /// Motion as odometry and attitude sensor tell it.
+    now_from_last: &'a Isometry3<f64>,
+    /// Covariance of the predicted pixel.
+    prediction_px2: &'a Matrix2<f64>,
+    last_stop: bool,
 }
 
 impl Tracker {
@@ -122,42 +134,29 @@ impl Tracker {
         prediction_px2: &Matrix2<f64>,
         last_stop: bool,
     ) -> Result<Fix, Refusal> {
+        let sought = Sought {
+            view,
+            now_from_last,
+            prediction_px2,
+            last_stop,
+        };
         let mut attempts = Vec::new();
         let newest = self.anchors.len() - 1;
-        let mut plan = vec![
-            (Attempt::Affine, newest, Freedom::Affine),
-            (Attempt::Translation, newest, Freedom::Translation),
-        ];
+        let mut plan = vec![(Attempt::Affine, newest), (Attempt::Translation, newest)];
         if newest > 0 {
-            plan.push((Attempt::PreviousAnchor, newest - 1, Freedom::Affine));
+            plan.push((Attempt::PreviousAnchor, newest - 1));
         }
-        for (attempt, index, freedom) in plan {
-            match self.attempt(view, now_from_last, prediction_px2, index, freedom) {
-                Ok(found) => {
-                    return Ok(self.accept(
-                        view,
-                        now_from_last,
-                        prediction_px2,
-                        (attempt, index, found),
-                        last_stop,
-                    ));
-                }
+        for (attempt, index) in plan {
+            match self.attempt(&sought, attempt, index) {
+                Ok(found) => return Ok(self.accept(&sought, (attempt, index, found))),
                 Err(error) => attempts.push((attempt, error)),
             }
         }
         if let Some(last) = self.last_stop.clone() {
             let before = self.anchors.clone();
             let index = self.push(last);
-            match self.attempt(view, now_from_last, prediction_px2, index, Freedom::Affine) {
-                Ok(found) => {
-                    return Ok(self.accept(
-                        view,
-                        now_from_last,
-                        prediction_px2,
-                        (Attempt::LastStop, index, found),
-                        last_stop,
-                    ));
-                }
+            match self.attempt(&sought, Attempt::LastStop, index) {
+                Ok(found) => return Ok(self.accept(&sought, (Attempt::LastStop, index, found))),
                 Err(error) => attempts.push((Attempt::LastStop, error)),
             }
             self.anchors = before;
@@ -176,18 +175,18 @@ impl Tracker {
 
     fn attempt(
         &self,
-        view: &View,
-        now_from_last: &Isometry3<f64>,
-        prediction_px2: &Matrix2<f64>,
+        sought: &Sought<'_>,
+        attempt: Attempt,
         index: usize,
-        freedom: Freedom,
     ) -> Result<Candidate, TrackError> {
+        let (view, now_from_last) = (&**sought.view, sought.now_from_last);
         let rules = &self.rules;
+        let gate = rules.gate(attempt);
         let camera = &view.cameras.left;
         let anchor = &self.anchors[index];
         let predicted = anchor.warp.moved(now_from_last);
         let footprint = predicted.jacobian(camera).ok_or(TrackError::NotVisible)?;
-        let reach = reach(&footprint, prediction_px2, rules.search_sigma)?;
+        let reach = reach(&footprint, sought.prediction_px2, rules.search_sigma)?;
         let template = self.lit_alike(view, anchor, now_from_last)?;
         let (found_px, score, second_score) =
             search(&template, &view.left, camera, &predicted, reach)?;
@@ -197,6 +196,13 @@ impl Tracker {
                 limit: rules.min_search_score,
                 columns: 2 * reach.u + 1,
                 rows: 2 * reach.v + 1,
+            });
+        }
+        if !(score - second_score >= gate.min_margin) {
+            return Err(TrackError::NotUnique {
+                score,
+                second_score,
+                margin: gate.min_margin,
             });
         }
         let (warp, _) = predicted
@@ -210,7 +216,7 @@ impl Tracker {
             Freedom::Translation,
             &rules.align,
         )?;
-        if freedom == Freedom::Affine {
+        if attempt != Attempt::Translation {
             (warp, aligned) = refine(
                 &template,
                 &view.left,
@@ -220,10 +226,10 @@ impl Tracker {
                 &rules.align,
             )?;
         }
-        if !(aligned.score >= rules.min_score) {
+        if !(aligned.score >= gate.min_score) {
             return Err(TrackError::LowScore {
                 score: aligned.score,
-                limit: rules.min_score,
+                limit: gate.min_score,
                 columns: 2 * reach.u + 1,
                 rows: 2 * reach.v + 1,
             });
@@ -231,6 +237,21 @@ impl Tracker {
         let pixel_px = warp
             .pixel(camera, &Vector2::zeros())
             .ok_or(TrackError::NotVisible)?;
+        let expected_px = predicted
+            .pixel(camera, &Vector2::zeros())
+            .ok_or(TrackError::NotVisible)?;
+        let innovation_px = pixel_px - expected_px;
+        let innovation_sigma = sought
+            .prediction_px2
+            .try_inverse()
+            .map_or(0.0, |p| innovation_px.dot(&(p * innovation_px)).sqrt());
+        if !(innovation_sigma <= gate.max_innovation_sigma) {
+            return Err(TrackError::Unexpected {
+                distance_px: innovation_px.norm(),
+                sigmas: innovation_sigma,
+                limit: gate.max_innovation_sigma,
+            });
+        }
         let plane = self.plane_at(view, &pixel_px, &predicted, now_from_last)?;
         let warp = warp
             .onto(camera, &plane.plane)
@@ -249,6 +270,8 @@ impl Tracker {
             surface: plane,
             score: aligned.score,
             second_score,
+            innovation_px,
+            innovation_sigma,
             back_px,
             sigma_px: spread.diagonal().max().sqrt(),
         })
@@ -332,19 +355,16 @@ impl Tracker {
 
     fn accept(
         &mut self,
-        view: &Arc<View>,
-        now_from_last: &Isometry3<f64>,
-        prediction_px2: &Matrix2<f64>,
+        sought: &Sought<'_>,
         (attempt, index, found): (Attempt, usize, Candidate),
-        last_stop: bool,
     ) -> Fix {
+        let Sought {
+            view,
+            now_from_last,
+            last_stop,
+            ..
+        } = *sought;
         let camera = &view.cameras.left;
-        let predicted_px = self.predicted_pixel(camera, now_from_last);
-        let innovation_px =
-            predicted_px.map_or_else(Vector2::zeros, |predicted| found.pixel_px - predicted);
-        let innovation_sigma = prediction_px2
-            .try_inverse()
-            .map_or(0.0, |p| innovation_px.dot(&(p * innovation_px)).sqrt());
         // what the match says about the motion: a turn about the camera
         let predicted = self.anchors[index].warp.moved(now_from_last);
         let turn = predicted
@@ -389,8 +409,8 @@ impl Tracker {
             score: found.score,
             second_score: found.second_score,
             back_px: found.back_px,
-            innovation_px,
-            innovation_sigma,
+            innovation_px: found.innovation_px,
+            innovation_sigma: found.innovation_sigma,
             sigma_px: found.sigma_px,
             attempt,
             anchored,

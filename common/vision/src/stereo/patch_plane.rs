@@ -98,6 +98,7 @@ impl PlaneRules {
             left_right_tolerance_px: 2.5,
             max_slope: 1.5,
             max_epipolar_px: 2.5,
+            max_correction_px: 4.0,
             max_sigma_px: 0.5,
             ..MatchRules::default()
         }

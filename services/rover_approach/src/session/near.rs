@@ -45,7 +45,7 @@ impl Session<'_> {
             Ok(choice) => (spot, choice),
             Err(refusal) => self.other_spot(&map).ok_or(refusal)?,
         };
-        let rules = BaseRules::default();
+        let rules = BaseRules::at_the_limit();
         let task = self.task(&rules)?;
         let here = self.served_from_here(&spot)?;
         let best_arm = choice.serving.iter().map(|s| s.arm_score);
@@ -108,10 +108,13 @@ impl Session<'_> {
     }
 
     fn choose(&self, spot: &TargetSpot, map: &GroundMap) -> Result<BaseChoice, Fault> {
-        let rules = BaseRules::default();
-        let task = self.task(&rules)?;
         let levelled = self.levelled(spot);
-        task.choose(&levelled, map).map_err(|none| {
+        let chosen = |rules: &BaseRules| Ok(self.task(rules)?.choose(&levelled, map));
+        let choice = match chosen(&BaseRules::default())? {
+            Ok(choice) => Ok(choice),
+            Err(_) => chosen(&BaseRules::at_the_limit())?,
+        };
+        choice.map_err(|none| {
             let mut found = fault("no_base_pose", none.to_string())
                 .with("candidates_n", f64::from(none.candidates_n));
             for (name, n) in &none.refused {
@@ -175,7 +178,7 @@ impl Session<'_> {
         spot: &TargetSpot,
     ) -> Result<Result<Serving, String>, Fault> {
         let level = self.level_from_rover();
-        let rules = BaseRules::default();
+        let rules = BaseRules::at_the_limit();
         let task = self.task(&rules)?;
         let here = PlanarPose {
             x_m: 0.0,
@@ -198,7 +201,7 @@ impl Session<'_> {
     }
 
     /// A way back, if the ground behind is known to be clear.
-    fn backwards(&self, map: &GroundMap) -> Option<Movement> {
+    pub(super) fn backwards(&self, map: &GroundMap) -> Option<Movement> {
         let behind = PlanarPose {
             x_m: -RETREAT_M,
             y_m: 0.0,

@@ -1,0 +1,86 @@
+//! The ground as the mast has seen it on the way.
+
+use super::Session;
+use crate::hardware::Frame;
+use crate::obstacles::{GroundMap, GroundRules};
+use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
+use rover_messages::{Fault, approach::ApproachActivity, status::work};
+use rover_vision::{MatchRules, sparse_points};
+
+/// Where the ground is looked at before each movement, m ahead.
+const HAZARD_LOOK_M: f64 = 2.0;
+/// Pixels between the points of the ground map.
+const MAP_STEP_PX: u32 = 20;
+/// What the mast sees so near to the rover is the rover itself, m.
+const OWN_M: f64 = 0.08;
+/// Frames whose points are kept.
+const MAP_FRAMES: usize = 6;
+
+impl Session<'_> {
+    /// Looks at the ground that the next movement leads over, unless the target's own image shows
+    /// it.
+    pub(super) async fn look_ahead(&mut self) -> Result<(), Fault> {
+        self.tell(ApproachActivity::Looking);
+        let bearing = self.estimate.position_m.xy().normalize();
+        let range_m = self.estimate.position_m.xy().norm();
+        if range_m < HAZARD_LOOK_M {
+            return Ok(());
+        }
+        let place = bearing * HAZARD_LOOK_M;
+        self.point_at(&Vector3::new(place.x, place.y, 0.0)).await?;
+        let frame = self.hardware.capture(&self.goal.target.pair, 0).await?;
+        self.remember(&frame);
+        Ok(())
+    }
+
+    pub(super) fn remember_ground(&mut self) {
+        let frame = self.now.clone();
+        self.remember(&frame);
+    }
+
+    /// Adds a frame's points to the ground known; those of old frames are forgotten.
+    fn remember(&mut self, frame: &Frame) {
+        let Some(site_from_rover) = frame.frame.site_from_rover() else {
+            return;
+        };
+        let view = &frame.view;
+        let rules = MatchRules {
+            range_min_m: 0.9,
+            range_max_m: 8.0,
+            ..MatchRules::default()
+        };
+        let points = self.hardware.shell.timed(work::VISION, || {
+            sparse_points(&view.left, &view.right, &view.cameras, MAP_STEP_PX, &rules)
+        });
+        let Ok(points) = points else { return };
+        let [half_x, half_y] = self.mobility.footprint_half_m;
+        let own = |p: &Vector3<f64>| {
+            let below = p.x.abs() < half_x + OWN_M && p.y.abs() < half_y + OWN_M;
+            below || self.shade.touches(p, OWN_M)
+        };
+        let in_site = points
+            .iter()
+            .filter(|(_, p)| !own(p))
+            .map(|(_, p)| (site_from_rover.isometry * Point3::from(*p)).coords)
+            .collect();
+        self.ground.push(in_site);
+        if self.ground.len() > MAP_FRAMES {
+            self.ground.remove(0);
+        }
+    }
+
+    /// The ground known, in the levelled rover frame.
+    pub(super) fn map(&self) -> GroundMap {
+        let pose = &self.wheels.pose;
+        let turn = UnitQuaternion::from_euler_angles(0.0, 0.0, pose.heading_rad);
+        let site_from_level = Isometry3::from_parts(pose.position_m.coords.into(), turn);
+        let level_from_site = site_from_level.inverse();
+        let points: Vec<Vector3<f64>> = self
+            .ground
+            .iter()
+            .flatten()
+            .map(|p| (level_from_site * Point3::from(*p)).coords)
+            .collect();
+        GroundMap::from_points(&points, GroundRules::default())
+    }
+}
