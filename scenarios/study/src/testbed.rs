@@ -203,21 +203,12 @@ impl Drawn {
         })
     }
 
-    /// A target at a true place and the vectors taken there if sight had no error at all: of the
-    /// mark at the place, of the mark where that vector brings it, of the mark with the tip at the
-    /// place, and of the plate's pose with the tip at the place.
-    ///
-    /// # Errors
-    /// `out_of_reach`.
-    pub fn exact_vectors(
-        &self,
-        at: &Vector3<f64>,
-        normal: &Unit<Vector3<f64>>,
-    ) -> Result<(Target, [Compensation; 4]), Fault> {
-        let target = Target {
+    /// A target at a true place as sight without any error designates it: through the true mount.
+    pub fn exact_target(&self, at: &Vector3<f64>, normal: &Unit<Vector3<f64>>) -> Target {
+        Target {
             pair: PAIR.into(),
-            pixel_px: [0.0; 2].into(),
-            right_pixel_px: [0.0; 2].into(),
+            pixel_px: [0.0; 2],
+            right_pixel_px: [0.0; 2],
             position_m: (self.believed_from_true * Point3::from(*at)).coords.into(),
             normal: Direction::<Rover>::from(self.seen_direction(normal)),
             covariance_m2: [[0.0; 3]; 3],
@@ -225,22 +216,24 @@ impl Drawn {
             roughness_mm: 0.0,
             points_n: 1,
             sim_time_s: 0.0,
-        };
+        }
+    }
+
+    /// The vectors taken at a target if sight had no error at all: of the mark there, of the mark
+    /// where that vector brings it, of the mark with the tip there, and of the plate's pose with
+    /// the tip there.
+    ///
+    /// # Errors
+    /// `out_of_reach`.
+    pub fn exact_vectors(&self, target: &Target) -> Result<[Compensation; 4], Fault> {
         let (tip, mark) = (&self.model, &self.model_of_mark);
         let none = Compensation::none();
-        let first = self.exact_vector(mark, mark, &none, &target)?;
-        let second =
-            self.exact_vector(mark, mark, &Compensation::constant(first.offset_m), &target)?;
-        let from_tip = self.exact_vector(tip, mark, &none, &target)?;
-        let plate = self.exact_vector(tip, tip, &none, &target)?;
-        let position_only = |c: &Compensation| Compensation::constant(c.offset_m);
-        let vectors = [
-            position_only(&first),
-            position_only(&second),
-            position_only(&from_tip),
-            plate,
-        ];
-        Ok((target, vectors))
+        let position_only = |c: Compensation| Compensation::constant(c.offset_m);
+        let first = position_only(self.exact_vector(mark, mark, &none, target)?);
+        let second = position_only(self.exact_vector(mark, mark, &first, target)?);
+        let from_tip = position_only(self.exact_vector(tip, mark, &none, target)?);
+        let plate = self.exact_vector(tip, tip, &none, target)?;
+        Ok([first, second, from_tip, plate])
     }
 
     /// Position and orientation error of the point that `seen` has as its tip, when `sent` places

@@ -26,6 +26,7 @@ const NO_LIMIT_M: f64 = 1.0;
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Errors {
     pub(super) mark: f64,
+    pub(super) exact: f64,
     pub(super) open_loop: f64,
     pub(super) tip: f64,
     pub(super) plate: f64,
@@ -41,6 +42,8 @@ pub(super) fn seed(config: &StudyConfig, trial: u64) -> u64 {
 struct Learnt {
     /// The mark's vector, the mark at the place.
     mark: Compensation,
+    /// The same if sight had no error.
+    exact: Compensation,
     /// The mark's vector, the tip at the place.
     tip: Compensation,
     /// The plate's pose, the tip at the place.
@@ -68,7 +71,7 @@ pub(super) fn one_robot(
     for place in places {
         let here = targets.iter().position(|t| t == place);
         let reference = here.and_then(|i| designated[i].clone());
-        let learnt = reference.and_then(|target| learn(&mut robot, &target).ok());
+        let learnt = reference.and_then(|target| learn(&mut robot, place, &target).ok());
         robot.forget();
         let mut errors = vec![None; targets.len()];
         if let Some(learnt) = learnt {
@@ -118,10 +121,12 @@ pub(super) fn look(
     Ok(placed.result.compensation)
 }
 
-fn learn(robot: &mut Drawn, target: &Target) -> Result<Learnt, Fault> {
+fn learn(robot: &mut Drawn, place: &Vector3<f64>, target: &Target) -> Result<Learnt, Fault> {
     let position = (Method::Epec, Observation::Position);
     let under_mark = robot.under_mark(target)?;
+    let [exact, ..] = robot.exact_vectors(&robot.exact_target(place, &-down()))?;
     Ok(Learnt {
+        exact,
         mark: look(robot, &under_mark, position, vec![0.0])?,
         tip: look(robot, target, position, vec![0.0])?,
         plate: look(robot, target, (Method::Epec, Observation::Pose), vec![0.0])?,
@@ -168,22 +173,27 @@ fn measured(
     near: &[f64],
 ) -> Result<Option<Errors>, StudyError> {
     let of_mark = |c: &Compensation| mark_error_mm(robot, c, target, at, near);
+    let exact_target = robot.exact_target(at, &-down());
     let of_tip = |c: &Compensation| tip_error_mm(robot, c, target, at, near);
     let all = (
         of_mark(&learnt.mark)?,
+        mark_error_mm(robot, &learnt.exact, &exact_target, at, near)?,
         of_mark(&Compensation::none())?,
         of_tip(&learnt.tip)?,
         of_tip(&learnt.plate)?,
         of_tip(&learnt.field)?,
     );
     Ok(match all {
-        (Some(mark), Some(open_loop), Some(tip), Some(plate), Some(field)) => Some(Errors {
-            mark,
-            open_loop,
-            tip,
-            plate,
-            field,
-        }),
+        (Some(mark), Some(exact), Some(open_loop), Some(tip), Some(plate), Some(field)) => {
+            Some(Errors {
+                mark,
+                exact,
+                open_loop,
+                tip,
+                plate,
+                field,
+            })
+        }
         _ => None,
     })
 }

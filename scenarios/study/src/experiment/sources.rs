@@ -137,7 +137,12 @@ fn one_robot(
     let near = robot.start()?;
     let vectors = match sight {
         Sight::Pictures => in_pictures(&mut robot, place),
-        Sight::Exact => robot.exact_vectors(place, &-down()),
+        Sight::Exact => {
+            let target = robot.exact_target(place, &-down());
+            robot
+                .exact_vectors(&target)
+                .map(|vectors| (target, vectors))
+        }
     };
     // A fiducial that was not found: this robot is in no mean.
     let Ok((target, [mark, second, tip, plate])) = vectors else {

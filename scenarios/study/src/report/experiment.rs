@@ -58,6 +58,9 @@ fn table(study: &Experiment) -> Table<'_, Reference> {
         .column("predicted, mm/m", |r| {
             format!("{:.1}", r.predicted_slope_mm_per_m)
         })
+        .column("exact sight, mm/m", |r| {
+            format!("{:.1}", r.exact_slope_mm_per_m)
+        })
         .column("at the place, mm", |r| format!("{:.2}", r.at_reference_mm))
         .column("intercept, mm", |r| format!("{:.2}", r.intercept_mm))
         .column("predicted, mm", |r| {

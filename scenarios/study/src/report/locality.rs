@@ -27,7 +27,8 @@ impl Shown for Locality {
         let charts: String = self.references.iter().map(scatter).collect();
         format!(
             "<p>{SENTENCE}</p><div class=\"charts\">{charts}</div>{}<p>1 deg and 2.5 mm, {} draws, \
-             seed {}; the tool points straight down everywhere. The field is made from six vectors \
+             seed {}; orange: 16 cm with the 0.5 mm that the paper prints and the 5 mm that it must \
+             mean; green: the field with 0.3 mm of noise on each vector. The tool points straight down everywhere. The field is made from six vectors \
              seen on a bent way of about 30 cm to the reference place; beside it from six on the \
              last straight 12 cm. The last column is the share of predictions whose stated 95 % \
              ellipsoid held the true vector.</p>",
@@ -94,15 +95,15 @@ fn scatter(r: &Reference) -> String {
                 marks: Marks::Line,
             },
             Series {
-                name: "field, 0.3 mm noise",
+                name: "field",
                 colour: GREEN,
                 points: points(|p| p.field_noisy_mm),
                 marks: Marks::Dots,
             },
             Series {
-                name: "paper: 16 cm, read 5 mm",
+                name: "paper: 0.5, 5 mm",
                 colour: ORANGE,
-                points: vec![(16.0, 5.0)],
+                points: vec![(16.0, 0.5), (16.0, 5.0)],
                 marks: Marks::Dots,
             },
         ],

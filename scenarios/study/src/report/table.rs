@@ -31,13 +31,23 @@ impl<'a, T> Table<'a, T> {
         let class = |column: usize| if column == 0 { " class=\"text\"" } else { "" };
         let mut out = String::from("<div class=\"scroll\"><table><tr>");
         for (i, (head, _)) in self.columns.iter().enumerate() {
-            let _ = write!(out, "<th{}>{}</th>", class(i), escape(head));
+            let _ = write!(
+                out,
+                "<th{} style=\"white-space:normal\">{}</th>",
+                class(i),
+                escape(head)
+            );
         }
         out += "</tr>";
         for row in 0..self.rows.len() {
             out += "<tr>";
             for (i, (_, cells)) in self.columns.iter().enumerate() {
-                let _ = write!(out, "<td{}>{}</td>", class(i), escape(&cells[row]));
+                let _ = write!(
+                    out,
+                    "<td{} style=\"white-space:nowrap\">{}</td>",
+                    class(i),
+                    escape(&cells[row])
+                );
             }
             out += "</tr>";
         }
@@ -119,10 +129,7 @@ mod tests {
             table.text(),
             "  what    value,\n  it is       mm\n  row 1      1.0\n  row 20    20.0\n"
         );
-        assert!(
-            table
-                .html()
-                .contains("<td class=\"text\">row 20</td><td>20.0</td>")
-        );
+        let html = table.html();
+        assert!(html.contains(">row 20</td>") && html.contains(">20.0</td>"));
     }
 }
