@@ -82,6 +82,26 @@ impl Testbed {
         &self.description
     }
 
+    /// The same testbed in another world.
+    pub fn altered(&self, change: impl FnOnce(&mut SimulationDescription)) -> Self {
+        let mut other = self.clone();
+        change(&mut other.description);
+        other
+    }
+
+    /// The believed robot's error model with the plate's central mark as the tip.
+    ///
+    /// # Errors
+    /// [`StudyError::Shipped`] never, for a binary that passes its tests.
+    pub fn model_of_mark(&self) -> Result<ErrorModel, StudyError> {
+        let layout = &self.robot.description().fiducial.layout;
+        let mark = layout.point(layout.discs.len());
+        let mark = mark.ok_or_else(|| StudyError::Shipped("bluestreak has no mark".into()))?;
+        let mut model = error_model(&self.robot);
+        model.tool.tip_in_link = (self.robot.link_from_plate * Point3::from(mark)).coords;
+        Ok(model)
+    }
+
     /// One draw of the true robot.
     ///
     /// # Errors
@@ -90,15 +110,10 @@ impl Testbed {
         let world = StillWorld::new(&self.robot, &self.description, seed)?;
         let missing = || StudyError::Shipped(format!("bluestreak has no pair {PAIR}"));
         let believed_from_true = world.pair(PAIR).ok_or_else(missing)?.believed_from_true;
-        let layout = &self.robot.description().fiducial.layout;
-        let mark = layout.point(layout.discs.len());
-        let mark = mark.ok_or_else(|| StudyError::Shipped("bluestreak has no mark".into()))?;
-        let mut model_of_mark = error_model(&self.robot);
-        model_of_mark.tool.tip_in_link = (self.robot.link_from_plate * Point3::from(mark)).coords;
         Ok(Drawn {
             robot: self.robot.clone(),
             model: error_model(&self.robot),
-            model_of_mark,
+            model_of_mark: self.model_of_mark()?,
             world,
             believed_from_true,
             frames: BTreeMap::new(),
@@ -135,6 +150,10 @@ fn fault(name: &str, message: impl Into<String>) -> Fault {
     Fault::new("study", name, message)
 }
 
+fn arm_fault(error: rover_kinematics::ArmError) -> Fault {
+    fault("internal", error.to_string())
+}
+
 fn simulation_fault(error: &SimulationError) -> Fault {
     fault("no_picture", error.to_string())
 }
@@ -166,6 +185,92 @@ impl Drawn {
         let link = self.world.arm().world_from_link(&solved.joints_rad)?;
         let mark = Point3::from(self.model_of_mark.tool.tip_in_link);
         Ok(Some((link * mark).coords))
+    }
+
+    /// The target that the tip is sent to so that the believed mark stands where `target` has the
+    /// tip: the servo, which places the tip, then looks at the mark there.
+    ///
+    /// # Errors
+    /// `out_of_reach`.
+    pub fn under_mark(&self, target: &Target) -> Result<Target, Fault> {
+        let q = self.command(&self.model_of_mark, &Compensation::none(), target)?;
+        let believed = self.model.rover_from_link(&q).map_err(arm_fault)?;
+        Ok(Target {
+            position_m: (believed * Point3::from(self.model.tool.tip_in_link))
+                .coords
+                .into(),
+            ..target.clone()
+        })
+    }
+
+    /// A target at a true place as sight without any error designates it: through the true mount.
+    pub fn exact_target(&self, at: &Vector3<f64>, normal: &Unit<Vector3<f64>>) -> Target {
+        Target {
+            pair: PAIR.into(),
+            pixel_px: [0.0; 2],
+            right_pixel_px: [0.0; 2],
+            position_m: (self.believed_from_true * Point3::from(*at)).coords.into(),
+            normal: Direction::<Rover>::from(self.seen_direction(normal)),
+            covariance_m2: [[0.0; 3]; 3],
+            plane_rms_mm: 0.0,
+            roughness_mm: 0.0,
+            points_n: 1,
+            sim_time_s: 0.0,
+        }
+    }
+
+    /// The vectors taken at a target if sight had no error at all: of the mark there, of the mark
+    /// where that vector brings it, of the mark with the tip there, and of the plate's pose with
+    /// the tip there.
+    ///
+    /// # Errors
+    /// `out_of_reach`.
+    pub fn exact_vectors(&self, target: &Target) -> Result<[Compensation; 4], Fault> {
+        let (tip, mark) = (&self.model, &self.model_of_mark);
+        let none = Compensation::none();
+        let position_only = |c: Compensation| Compensation::constant(c.offset_m);
+        let first = position_only(self.exact_vector(mark, mark, &none, target)?);
+        let second = position_only(self.exact_vector(mark, mark, &first, target)?);
+        let from_tip = position_only(self.exact_vector(tip, mark, &none, target)?);
+        let plate = self.exact_vector(tip, tip, &none, target)?;
+        Ok([first, second, from_tip, plate])
+    }
+
+    /// Position and orientation error of the point that `seen` has as its tip, when `sent` places
+    /// its own on the target with `vector`.
+    fn exact_vector(
+        &self,
+        sent: &ErrorModel,
+        seen: &ErrorModel,
+        vector: &Compensation,
+        target: &Target,
+    ) -> Result<Compensation, Fault> {
+        let q = self.command(sent, vector, target)?;
+        let truth = self.world.arm().world_from_link(&q).map_err(arm_fault)?;
+        let looks_like = self.believed_from_true * truth;
+        let believed = seen.rover_from_link(&q).map_err(arm_fault)?;
+        let point = Point3::from(seen.tool.tip_in_link);
+        let turn = looks_like.rotation * believed.rotation.inverse();
+        Ok(Compensation {
+            offset_m: (looks_like * point - believed * point).into(),
+            offset_rad: turn.scaled_axis().into(),
+            parameters: Vec::new(),
+        })
+    }
+
+    /// Joint angles, nearest to the start, that put a model's tip on a target.
+    fn command(
+        &self,
+        model: &ErrorModel,
+        vector: &Compensation,
+        target: &Target,
+    ) -> Result<Vec<f64>, Fault> {
+        let near = self.start().map_err(|e| fault("internal", e.to_string()))?;
+        let (at, axis) = (&target.position_m.coords, -target.normal.unit);
+        let solved = model.solve(vector, at, &axis, &near);
+        solved
+            .map(|s| s.joints_rad)
+            .map_err(|e| fault("out_of_reach", e.to_string()))
     }
 
     /// Turns a true direction into the one that the believed cameras see.

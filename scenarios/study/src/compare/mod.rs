@@ -12,8 +12,10 @@ mod rendered;
 mod verdict;
 
 use super::{StudyConfig, StudyError, statistics::quantile};
-pub(super) use numeric::sightings;
+use nalgebra::{Unit, Vector3};
+pub(super) use numeric::{believed_cameras, sightings};
 use published::independent;
+use rayon::prelude::*;
 use rover_methods::Kind;
 use serde::Serialize;
 
@@ -163,8 +165,61 @@ pub fn compare(
     })
 }
 
+impl Outcome {
+    /// The true tip's error (m) on a surface with this normal, and the computing of one cycle and
+    /// of the whole placement (us); none for an error that is not finite.
+    fn of(
+        error: &Vector3<f64>,
+        normal: &Unit<Vector3<f64>>,
+        (cycle_us, placement_us): (f64, f64),
+    ) -> Option<Self> {
+        let error_m = error.norm();
+        error_m.is_finite().then(|| Self {
+            error_m,
+            lateral_m: (error - normal.into_inner() * error.dot(normal)).norm(),
+            cycle_us,
+            placement_us,
+        })
+    }
+}
+
+/// Distance from the target at which the look of this index is taken, m.
+fn distance_m(look: usize, occlusion_cm: u32) -> f64 {
+    let blind_m = f64::from(occlusion_cm) * 0.01;
+    START_M + (blind_m - START_M) * look as f64 / (LOOKS - 1) as f64
+}
+
 /// The outcomes of one method with one blind part, trial by trial.
 type Outcomes = (u32, Kind, Vec<Option<Outcome>>);
+
+/// Draws each trial once and places with every method and every blind part in it.
+fn by_trial<T>(
+    trials: usize,
+    occlusions_cm: &[u32],
+    draw: impl Fn(usize) -> Result<T, StudyError> + Sync,
+    place: impl Fn(&mut T, Kind, u32) -> Option<Outcome> + Sync,
+) -> Result<Vec<Outcomes>, StudyError> {
+    let combinations: Vec<(u32, Kind)> = occlusions_cm
+        .iter()
+        .flat_map(|cm| Kind::ALL.map(|kind| (*cm, kind)))
+        .collect();
+    let trials: Vec<Vec<Option<Outcome>>> = (0..trials)
+        .into_par_iter()
+        .map(|trial| {
+            let mut drawn = draw(trial)?;
+            let outcomes = combinations.iter();
+            Ok(outcomes
+                .map(|(cm, kind)| place(&mut drawn, *kind, *cm))
+                .collect())
+        })
+        .collect::<Result<_, StudyError>>()?;
+    let of = |i: usize| trials.iter().map(|t| t[i].clone()).collect();
+    Ok(combinations
+        .iter()
+        .enumerate()
+        .map(|(i, (cm, kind))| (*cm, *kind, of(i)))
+        .collect())
+}
 
 fn cell(kind: Kind, case: Case, occlusion_cm: u32, outcomes: &[Option<Outcome>]) -> Cell {
     let of_all = |of: fn(&Outcome) -> f64, p: f64| {

@@ -1,6 +1,6 @@
 //! Pixels from the true geometry with noise; no images.
 
-use super::{Case, Failed, LOOKS, Outcome, Outcomes, START_M};
+use super::{Case, Failed, LOOKS, Outcome, Outcomes, START_M, by_trial, distance_m};
 use crate::{
     StudyError,
     draws::Draws,
@@ -8,7 +8,6 @@ use crate::{
     world::{TrueRobot, believed},
 };
 use nalgebra::{Isometry3, Point3, Rotation3, Unit, UnitQuaternion, Vector2, Vector3};
-use rayon::prelude::*;
 use rover_cameras::{Camera, StereoPair};
 use rover_methods::{Kind, Reference, Sample, Setup};
 use std::{sync::Arc, time::Instant};
@@ -38,7 +37,7 @@ struct Truth {
     cameras: StereoPair,
     setup: Arc<Setup>,
     target: Vector3<f64>,
-    normal: Vector3<f64>,
+    normal: Unit<Vector3<f64>>,
     believed_target: Reference,
     upward: Unit<Vector3<f64>>,
     initial: Vec<Sample>,
@@ -77,17 +76,22 @@ fn cameras(case: Case, draws: &mut Draws) -> StereoPair {
     }
 }
 
+/// The paper's pair as it is believed to be, arm base frame.
+pub fn believed_cameras() -> StereoPair {
+    let straight = Rotation3::identity();
+    StereoPair {
+        left: camera(0, FOCAL_PX, &straight, false),
+        right: camera(1, FOCAL_PX, &straight, false),
+    }
+}
+
 fn believed_setup(case: Case) -> Result<Setup, StudyError> {
     let mut model = believed()?;
     model.tool.tip_in_link = Vector3::new(0.0, 0.0, TIP_M);
     let behind = if case == Case::Behind { 0.09 } else { 0.0 };
-    let straight = Rotation3::identity();
     Ok(Setup {
         model,
-        cameras: StereoPair {
-            left: camera(0, FOCAL_PX, &straight, false),
-            right: camera(1, FOCAL_PX, &straight, false),
-        },
+        cameras: believed_cameras(),
         fiducial_in_link: Vector3::new(0.0, 0.0, TIP_M - behind),
         angle_rad: LEVELS[2].angle_rad(),
         length_m: LEVELS[2].length_m(),
@@ -111,15 +115,19 @@ impl Truth {
             draws.between(0.10, 0.30),
         );
         let tilt = |draws: &mut Draws, sigma: f64| {
-            Vector3::new(sigma * draws.normal(), sigma * draws.normal(), 1.0).normalize()
+            Unit::new_normalize(Vector3::new(
+                sigma * draws.normal(),
+                sigma * draws.normal(),
+                1.0,
+            ))
         };
         let normal = tilt(&mut draws, 0.25);
-        let upward = Unit::new_normalize(-tilt(&mut draws, 0.5));
+        let upward = -tilt(&mut draws, 0.5);
         let cameras = cameras(case, &mut draws);
         let mut truth = Self {
             believed_target: Reference {
                 tip_in_rover: target,
-                axis_in_rover: Unit::new_normalize(robot.believed_from_true.rotation * normal),
+                axis_in_rover: robot.believed_from_true.rotation * normal,
             },
             robot,
             cameras,
@@ -266,7 +274,6 @@ fn place(truth: &Truth, kind: Kind, occlusion_cm: u32, noise: &[u64]) -> Result<
             Ok(Vector3::zeros())
         })?;
     }
-    let blind_m = f64::from(occlusion_cm) * 0.01;
     let goal = &truth.believed_target;
     let axis = goal.axis_in_rover;
     let mut q = truth.first_joints();
@@ -275,7 +282,7 @@ fn place(truth: &Truth, kind: Kind, occlusion_cm: u32, noise: &[u64]) -> Result<
         let distance = if k == LOOKS {
             0.0
         } else {
-            START_M + (blind_m - START_M) * k as f64 / (LOOKS - 1) as f64
+            distance_m(k, occlusion_cm)
         };
         let reference = Reference {
             tip_in_rover: goal.tip_in_rover + truth.upward.into_inner() * distance,
@@ -304,17 +311,8 @@ fn place(truth: &Truth, kind: Kind, occlusion_cm: u32, noise: &[u64]) -> Result<
         .arm
         .point(&q, &truth.setup.model.tool.tip_in_link)
         .map_err(|_| Failed)?;
-    let error = tip - truth.target;
-    let error_m = error.norm();
-    if !error_m.is_finite() {
-        return Err(Failed);
-    }
-    Ok(Outcome {
-        error_m,
-        lateral_m: (error - truth.normal * error.dot(&truth.normal)).norm(),
-        cycle_us: busy_us / f64::from(cycles),
-        placement_us: busy_us,
-    })
+    let times_us = (busy_us / f64::from(cycles), busy_us);
+    Outcome::of(&(tip - truth.target), &truth.normal, times_us).ok_or(Failed)
 }
 
 /// Runs one case.
@@ -328,20 +326,10 @@ pub fn outcomes(
     occlusions_cm: &[u32],
 ) -> Result<Vec<Outcomes>, StudyError> {
     let setup = Arc::new(believed_setup(case)?);
-    let truths: Vec<Truth> = (0..trials)
-        .into_par_iter()
-        .map(|trial| Truth::draw(&setup, case, seed, trial))
-        .collect::<Result<_, _>>()?;
-    let mut out = Vec::new();
-    for &occlusion_cm in occlusions_cm {
-        for kind in Kind::ALL {
-            let outcomes = truths
-                .par_iter()
-                .enumerate()
-                .map(|(trial, truth)| place(truth, kind, occlusion_cm, &[seed, trial as u64]).ok())
-                .collect();
-            out.push((occlusion_cm, kind, outcomes));
-        }
-    }
-    Ok(out)
+    by_trial(
+        trials,
+        occlusions_cm,
+        |trial| Ok((trial as u64, Truth::draw(&setup, case, seed, trial)?)),
+        |(trial, truth), kind, occlusion_cm| place(truth, kind, occlusion_cm, &[seed, *trial]).ok(),
+    )
 }

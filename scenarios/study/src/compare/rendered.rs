@@ -1,14 +1,13 @@
 //! Images of the testbed, the servo's detector and the servo's loop: each method as a scenario would
 //! run it, without the time that motions take.
 
-use super::{Case, LOOKS, Outcome, Outcomes, START_M};
+use super::{Case, LOOKS, Outcome, Outcomes, by_trial, distance_m};
 use crate::{
     StudyError,
     draws::{Draws, key},
     testbed::{Drawn, PAIR, Testbed},
 };
 use nalgebra::{Unit, Vector3};
-use rayon::prelude::*;
 use rover_epec_servo::{estimator::EstimatorRules, place::error_model, survey::is_visible};
 use rover_geometry::{Direction, Rover};
 use rover_messages::{
@@ -64,7 +63,7 @@ impl Trial {
                 };
                 is_visible(&bed.robot, &model, &pair.cameras, &pose, &start)
             };
-            if !(sees(0.0) && sees(START_M)) {
+            if !(sees(0.0) && sees(super::START_M)) {
                 continue;
             }
             if let Ok(target) = drawn.target(&at, &normal) {
@@ -82,11 +81,7 @@ impl Trial {
     }
 
     fn place(&mut self, kind: Kind, case: Case, occlusion_cm: u32) -> Option<Outcome> {
-        let blind_m = f64::from(occlusion_cm) * 0.01;
-        let stations = (0..LOOKS).map(|k| {
-            let gone = k as f64 / (LOOKS - 1) as f64;
-            START_M + (blind_m - START_M) * gone
-        });
+        let stations = (0..LOOKS).map(|k| distance_m(k, occlusion_cm));
         let goal = PlaceGoal {
             target: self.target.clone(),
             stations_m: stations.collect(),
@@ -107,15 +102,9 @@ impl Trial {
         };
         let placed = self.drawn.place(&goal, rules).ok()?;
         let tip = self.drawn.true_tip(&placed.joints_rad).ok()?;
-        let error = tip - self.at;
-        let normal = self.normal.into_inner();
-        let error_m = error.norm();
-        error_m.is_finite().then(|| Outcome {
-            error_m,
-            lateral_m: (error - normal * error.dot(&normal)).norm(),
-            cycle_us: placed.computing_us / f64::from(placed.cycles.max(1)),
-            placement_us: placed.computing_us,
-        })
+        let cycle_us = placed.computing_us / f64::from(placed.cycles.max(1));
+        let times_us = (cycle_us, placed.computing_us);
+        Outcome::of(&(tip - self.at), &self.normal, times_us)
     }
 }
 
@@ -134,26 +123,10 @@ pub fn outcomes(
         _ => IntrinsicsError::default(),
     };
     let bed = Testbed::bluestreak(intrinsics)?;
-    let combinations: Vec<(u32, Kind)> = occlusions_cm
-        .iter()
-        .flat_map(|g| Kind::ALL.map(|kind| (*g, kind)))
-        .collect();
-    let by_trial: Vec<Vec<Option<Outcome>>> = (0..trials)
-        .into_par_iter()
-        .map(|trial| {
-            let mut trial = Trial::draw(&bed, seed, trial as u64)?;
-            Ok(combinations
-                .iter()
-                .map(|(g, kind)| trial.place(*kind, case, *g))
-                .collect())
-        })
-        .collect::<Result<_, StudyError>>()?;
-    Ok(combinations
-        .iter()
-        .enumerate()
-        .map(|(i, (g, kind))| {
-            let outcomes = by_trial.iter().map(|t| t[i].clone()).collect();
-            (*g, *kind, outcomes)
-        })
-        .collect())
+    by_trial(
+        trials,
+        occlusions_cm,
+        |trial| Trial::draw(&bed, seed, trial as u64),
+        |trial, kind, occlusion_cm| trial.place(kind, case, occlusion_cm),
+    )
 }

@@ -1,8 +1,11 @@
 //! What the comparison says, from its own numbers.
 
-use super::{Case, Comparison, OCCLUSIONS_CM};
+use super::{Case, Cell, Comparison, OCCLUSIONS_CM};
 use rover_methods::Kind;
 use std::fmt::Write;
+
+/// Medians that differ by less agree: the scatter of a median of 200 trials, twice.
+const AGREEMENT: f64 = 0.2;
 
 impl Comparison {
     /// The methods whose median is better than EPEC's by more than 2 %, best first; none if EPEC
@@ -43,6 +46,34 @@ impl Comparison {
             .collect()
     }
 
+    /// How the medians agree with those of the independent program: how many of how many lie within
+    /// 20 %, and each that does not.
+    pub fn agreement(&self) -> String {
+        let compared: Vec<(&Cell, f64, f64)> = self
+            .methods
+            .iter()
+            .filter_map(|c| Some((c, c.median_mm?, c.independent_mm?)))
+            .collect();
+        let outside: Vec<String> = compared
+            .iter()
+            .filter(|(_, here, there)| (here / there - 1.0).abs() > AGREEMENT)
+            .map(|(c, here, there)| {
+                let (name, case, cm) = (c.name, c.case.name(), c.occlusion_cm);
+                format!("{name} ({case}, blind {cm} cm) {here:.2} for {there:.2}")
+            })
+            .collect();
+        let within = compared.len() - outside.len();
+        let mut out = format!(
+            "{within} of the {} medians that the independent program has, too, agree within {:.0} %",
+            compared.len(),
+            100.0 * AGREEMENT
+        );
+        if !outside.is_empty() {
+            let _ = write!(out, "; outside, in mm: {}", outside.join(", "));
+        }
+        out + "."
+    }
+
     /// What the study says.
     pub fn verdict(&self) -> String {
         let at = |kind, cm| self.median_mm(kind, Case::Plain, cm);
@@ -57,13 +88,14 @@ impl Comparison {
              {} mm. HIPS is {} times better than kinematics in its limited and {} times in its \
              full version (published: about 2 and about 10); the height of its initial poses was \
              chosen among three so that the limited version agrees with the independent program. \
-             Position-based servoing with gain 1 is EPEC by another name.",
+             Position-based servoing with gain 1 is EPEC by another name. {}",
             number(at(Kind::Epec, 0)),
             number(at(Kind::Kinematic, 0)),
             number(at(Kind::Epec, 10)),
             number(at(Kind::EpecField, 10)),
             gain(Kind::HipsLimited),
             gain(Kind::HipsFull),
+            self.agreement(),
         );
         let images = |kind, case, cm| number(self.median_mm(kind, case, cm));
         let blind = |case, cm| {

@@ -1,12 +1,11 @@
 //! The experiment on page and terminal.
 
-use super::Shown;
-use crate::experiment::{Experiment, ExperimentPoint, Reference};
+use super::{Shown, open_loop_mm, table::Table};
+use crate::experiment::{AtReference, Experiment, ExperimentPoint, Reference};
 use rover_page::{
     BLUE, GREEN, ORANGE, PURPLE,
     plot::{Marks, Plot, Series},
 };
-use std::fmt::Write;
 
 impl Shown for Experiment {
     const NAME: &'static str = "experiment";
@@ -17,76 +16,83 @@ impl Shown for Experiment {
     }
 
     fn lines(&self) -> String {
-        let mut out = String::from(
-            "  vector taken at               slope   predicted   intercept   r2     at 16 cm   \
-             tip: from  with plate  field\n",
-        );
-        for r in &self.references {
-            let _ = writeln!(
-                out,
-                "  {:<28} {:>4.1} mm/m {:>4.1} mm/m {:>5.2} mm   {:.3}  {:>4.1} mm  \
-                 {:>5.1} mm   {:>5.1} mm    {:>4.1} mm/m",
-                r.name,
-                r.slope_mm_per_m,
-                r.predicted_slope_mm_per_m,
-                r.intercept_mm,
-                r.r2,
-                r.error_at_16cm_mm,
-                r.tip_intercept_mm,
-                r.plate_intercept_mm,
-                r.field_slope_mm_per_m
-            );
-        }
-        out
+        format!("{}{}", table(self).text(), sources(self).text())
     }
 
     fn section(&self) -> String {
-        let (mut rows, mut charts) = (String::new(), String::new());
-        for r in &self.references {
-            charts += &scatter(r);
-            let open_loop: f64 =
-                r.points.iter().map(|p| p.open_loop_mm).sum::<f64>() / r.points.len().max(1) as f64;
-            let _ = write!(
-                rows,
-                "<tr><td class=\"text\">{}</td><td>{open_loop:.1}</td><td>{:.1}</td><td>{:.1}</td>\
-                 <td>{:.2}</td><td>{:.3}</td><td>{:.1}</td><td>{:.1}</td><td>{:.1}</td>\
-                 <td>{:.1}</td><td>{:.1}</td><td>{:.1}</td><td>{} x {}</td></tr>",
-                r.name,
-                r.slope_mm_per_m,
-                r.predicted_slope_mm_per_m,
-                r.intercept_mm,
-                r.r2,
-                r.error_at_16cm_mm,
-                r.tip_slope_mm_per_m,
-                r.tip_intercept_mm,
-                r.plate_slope_mm_per_m,
-                r.plate_intercept_mm,
-                r.field_slope_mm_per_m,
-                r.robots,
-                r.points.len()
-            );
-        }
+        let charts: String = self.references.iter().map(scatter).collect();
         format!(
             "<p>The Bluestreak testbed, drawn {} times with 1 deg and 2.5 mm; focal lengths wrong by \
              {} %, principal points by {} px (one sigma), the arm drooping under its own weight. \
-             One stereo pair of the arm at the reference place gives the vector. Each target is a \
-             fiducial held there, found in a stereo pair; the arm's own mark is then sent to it and \
-             its true place measured (dots: purple without correction, blue with the vector; green: \
-             the tip with the field). Orange: the slope that the numeric study of locality predicts, from the \
-             same intercept. The paper states no numbers for its figure 7; it reports correction \
-             useful as far as 20 cm and a slope slightly steeper than predicted. Seed {}.</p>\
-             <div class=\"charts\">{charts}</div><div class=\"scroll\"><table><tr>\
-             <th class=\"text\">vector taken at</th><th>open loop, mm</th><th>slope, mm/m</th>\
-             <th>predicted, mm/m</th><th>intercept, mm</th><th>r2</th><th>at 16 cm, mm</th>\
-             <th>tip, mm/m</th><th>from, mm</th><th>tip by plate, mm/m</th><th>from, mm</th>\
-             <th>tip by field, mm/m</th>\
-             <th>robots x targets</th></tr>{rows}</table></div>",
+             One stereo pair with the arm\u{2019}s mark at the reference place gives the vector. Each \
+             target is a fiducial held there, found in a stereo pair; the arm\u{2019}s own mark is \
+             then sent to it and its true place measured (dots: purple without correction, blue with \
+             the vector; green: the tip with the field). Orange: the slope that the numeric study \
+             of locality predicts, from the same intercept. The paper states no numbers for its \
+             figure 7; it reports correction useful as far as 20 cm and a slope slightly steeper \
+             than predicted. Seed {}.</p><div class=\"charts\">{charts}</div>{}<p>{SOURCES}</p>{}",
             self.trials,
             self.intrinsics.0 * 100.0,
             self.intrinsics.1,
-            self.seed
+            self.seed,
+            table(self).html(),
+            sources(self).html()
         )
     }
+}
+
+const SOURCES: &str = "What is left at the first place itself, mean over the robots, mm, with one \
+    thing at a time taken away. The mark\u{2019}s vector is taken with the mark there; the second \
+    one where the first brought it. \u{201c}9 cm away\u{201d}: the same with the tip at the place, \
+    so that the mark is seen a lever\u{2019}s length from where it is sent; the tip\u{2019}s error with \
+    that vector is the lever times the error of the last link\u{2019}s direction, which a single \
+    mark does not show.";
+
+fn table(study: &Experiment) -> Table<'_, Reference> {
+    Table::of(&study.references)
+        .column("vector taken at", |r| r.name.to_owned())
+        .column("open loop, mm", |r| {
+            open_loop_mm(r.points.iter().map(|p| p.open_loop_mm))
+        })
+        .column("slope, mm/m", |r| format!("{:.1}", r.slope_mm_per_m))
+        .column("predicted, mm/m", |r| {
+            format!("{:.1}", r.predicted_slope_mm_per_m)
+        })
+        .column("exact sight, mm/m", |r| {
+            format!("{:.1}", r.exact_slope_mm_per_m)
+        })
+        .column("at the place, mm", |r| format!("{:.2}", r.at_reference_mm))
+        .column("intercept, mm", |r| format!("{:.2}", r.intercept_mm))
+        .column("predicted, mm", |r| {
+            format!("{:.2}", r.predicted_intercept_mm)
+        })
+        .column("r2", |r| format!("{:.3}", r.r2))
+        .column("at 16 cm, mm", |r| format!("{:.1}", r.error_at_16cm_mm))
+        .column("tip, mm/m", |r| format!("{:.1}", r.tip_slope_mm_per_m))
+        .column("from, mm", |r| format!("{:.1}", r.tip_intercept_mm))
+        .column("tip by plate, mm/m", |r| {
+            format!("{:.1}", r.plate_slope_mm_per_m)
+        })
+        .column("from, mm", |r| format!("{:.1}", r.plate_intercept_mm))
+        .column("tip by field, mm/m", |r| {
+            format!("{:.1}", r.field_slope_mm_per_m)
+        })
+        .column("robots x targets", |r| {
+            format!("{} x {}", r.robots, r.points.len())
+        })
+}
+
+fn sources(study: &Experiment) -> Table<'_, AtReference> {
+    let mm = |x: f64| format!("{x:.2}");
+    Table::of(&study.at_reference)
+        .column("at the first place", |a| a.setting.to_owned())
+        .column("open loop", |a| format!("{:.1}", a.open_loop_mm))
+        .column("mark", move |a| mm(a.mark_mm))
+        .column("second vector", move |a| mm(a.mark_second_mm))
+        .column("mark, 9 cm away", move |a| mm(a.mark_from_tip_mm))
+        .column("tip, mark\u{2019}s vector", move |a| mm(a.tip_mm))
+        .column("tip, plate\u{2019}s pose", move |a| mm(a.plate_mm))
+        .column("robots", |a| a.robots.to_string())
 }
 
 /// One reference place as a plot.

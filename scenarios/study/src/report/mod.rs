@@ -6,11 +6,12 @@ mod cost;
 mod experiment;
 mod locality;
 mod sensitivity;
+mod table;
 mod table1;
 
 use super::{
     compare::Comparison, cost::Cost, experiment::Experiment, locality::Locality,
-    sensitivity::Sensitivity, table1::Table1,
+    sensitivity::Sensitivity, statistics::mean, table1::Table1,
 };
 use rover_page::{document, escape};
 use serde::Serialize;
@@ -159,6 +160,11 @@ impl Page {
             "<section id=\"{id}\"><h2>{title}</h2>\n{content}\n</section>\n"
         );
     }
+}
+
+/// Mean of the open-loop errors of some targets, mm.
+fn open_loop_mm(of_targets: impl Iterator<Item = f64>) -> String {
+    format!("{:.1}", mean(&of_targets.collect::<Vec<_>>()))
 }
 
 /// A number of millimetres, or that too many trials failed.

@@ -1,12 +1,11 @@
 //! Table 1 on page and terminal.
 
-use super::Shown;
+use super::{Shown, table::Table};
 use crate::table1::{Row, Table1};
 use rover_page::{
     BLUE, GREEN, ORANGE,
     plot::{Marks, Plot, Series},
 };
-use std::fmt::Write;
 
 impl Shown for Table1 {
     const NAME: &'static str = "table1";
@@ -17,54 +16,16 @@ impl Shown for Table1 {
     }
 
     fn lines(&self) -> String {
-        let mut out = String::from(
-            "  errors (1 sigma)   before: paper, here   after: paper, here   95 %   \
-                    second   mm\n",
-        );
-        for r in &self.rows {
-            let _ = writeln!(
-                out,
-                "  {:.1} deg {:.1} mm     {:>9.1} {:>8.1}     {:>9.1} {:>8.2} {:>8.2} {:>8.3}",
-                r.angle_deg,
-                r.length_mm,
-                r.paper_before_mm,
-                r.before_mm,
-                r.paper_after_mm,
-                r.after_mm,
-                r.after_p95_mm,
-                r.after_two_mm
-            );
-        }
         let trials: usize = self.rows.iter().map(|r| r.targets * r.trials).sum();
-        let _ = writeln!(
-            out,
-            "  {trials} trials in {:.1} ms on {} thread(s)",
-            self.compute_ms, self.threads
-        );
-
-        out
+        format!(
+            "{}  {trials} trials in {:.1} ms on {} thread(s)\n",
+            table(self).text(),
+            self.compute_ms,
+            self.threads
+        )
     }
 
     fn section(&self) -> String {
-        let mut rows = String::new();
-        for r in &self.rows {
-            let _ = write!(
-                rows,
-                "<tr><td class=\"text\">{} deg, {} mm</td><td>{}</td><td>{:.1}</td><td>{}</td>\
-             <td>{:.2}</td><td>{:.2}</td><td>{:.3}</td><td>{:.4}</td><td>{} x {}</td></tr>",
-                r.angle_deg,
-                r.length_mm,
-                r.paper_before_mm,
-                r.before_mm,
-                r.paper_after_mm,
-                r.after_mm,
-                r.after_p95_mm,
-                r.after_two_mm,
-                r.after_three_mm,
-                r.targets,
-                r.trials
-            );
-        }
         let stages = |of: &dyn Fn(&Row) -> Vec<f64>, i: usize| -> Vec<(f64, f64)> {
             let values = self.rows.get(i).map(of).unwrap_or_default();
             values
@@ -97,14 +58,29 @@ impl Shown for Table1 {
             ],
         };
         format!(
-            "<div class=\"charts\">{}</div><div class=\"scroll\"><table><tr><th class=\"text\">errors, \
-         one sigma</th><th>before: paper, mm</th><th>here</th><th>after: paper, mm</th><th>here</th>\
-         <th>here, 95 %</th><th>second</th><th>third</th><th>targets x draws</th></tr>{rows}</table>\
-         </div><p>Computed in {:.1} ms on {} thread(s), seed {}.</p>",
+            "<div class=\"charts\">{}</div>{}<p>Computed in {:.1} ms on {} thread(s), seed {}.</p>",
             plot.svg(),
+            table(self).html(),
             self.compute_ms,
             self.threads,
             self.seed
         )
     }
+}
+
+fn table(study: &Table1) -> Table<'_, Row> {
+    Table::of(&study.rows)
+        .column("errors, one sigma", |r| {
+            format!("{} deg, {} mm", r.angle_deg, r.length_mm)
+        })
+        .column("before: paper, mm", |r| format!("{:.1}", r.paper_before_mm))
+        .column("here, mm", |r| format!("{:.1}", r.before_mm))
+        .column("after: paper, mm", |r| format!("{:.1}", r.paper_after_mm))
+        .column("here, mm", |r| format!("{:.2}", r.after_mm))
+        .column("here, 95 %, mm", |r| format!("{:.2}", r.after_p95_mm))
+        .column("second, mm", |r| format!("{:.3}", r.after_two_mm))
+        .column("third, mm", |r| format!("{:.4}", r.after_three_mm))
+        .column("targets x draws", |r| {
+            format!("{} x {}", r.targets, r.trials)
+        })
 }

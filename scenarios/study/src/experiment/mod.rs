@@ -3,25 +3,28 @@
 //! arm sent to each with and without correction, its true place measured.
 //!
 //! As in the numeric study the point that is measured is the one that is tracked: the fiducial's
-//! mark. What that means for the instrument's tip stands beside it.
+//! mark, which stands at the reference place when its vector is taken. What that means for the
+//! instrument's tip, 9 cm from the mark, stands beside it; [`sources`] takes what is left at the
+//! reference place itself apart.
+
+mod robot;
+mod sources;
+mod verdict;
+
+pub use sources::AtReference;
 
 use super::{
     StudyConfig, StudyError,
     locality::{self, locality},
     statistics::{Line, mean},
-    testbed::{Drawn, PAIR, Testbed},
+    testbed::{PAIR, Testbed},
 };
 use nalgebra::{Unit, Vector3};
 use rayon::prelude::*;
-use rover_compensation::Compensation;
-use rover_epec_servo::{estimator::EstimatorRules, survey::is_visible};
+use robot::{Errors, one_robot};
+use rover_epec_servo::survey::is_visible;
 use rover_geometry::{Direction, Rover};
-use rover_messages::{
-    Fault,
-    placement::{Method, Observation, PlaceGoal},
-    planning::ToolPose,
-    target::Target,
-};
+use rover_messages::planning::ToolPose;
 use rover_sim::IntrinsicsError;
 use serde::Serialize;
 
@@ -31,13 +34,11 @@ pub const TRIALS: usize = 20;
 const THEORY_TRIALS: usize = 60;
 /// Distances that the straight line is fitted to, m.
 const FITTED_M: (f64, f64) = (0.02, 0.40);
-/// Looks of the field, and how far above the reference place the first one is, m.
-const LOOKS: usize = 6;
-const APPROACH_M: f64 = 0.12;
-/// Tolerance that ends the servo's loop with its first look at a station, m.
-const ANY_M: f64 = 0.1;
-/// No placement is refused for what is predicted of it.
-const NO_LIMIT_M: f64 = 1.0;
+/// Calibrated cameras are never exact; the paper names that as what steepens the slope.
+const INTRINSICS: IntrinsicsError = IntrinsicsError {
+    focal_fraction: 1e-3,
+    principal_point_px: 0.3,
+};
 
 /// The study's result.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -50,6 +51,8 @@ pub struct Experiment {
     pub intrinsics: (f64, f64),
     /// One entry per place where the vector was taken.
     pub references: Vec<Reference>,
+    /// What is left at the first of these places itself, with error sources taken away.
+    pub at_reference: Vec<AtReference>,
 }
 
 /// One place where the vector was taken.
@@ -63,12 +66,16 @@ pub struct Reference {
     pub points: Vec<ExperimentPoint>,
     /// Slope of the error of one vector, mm/m.
     pub slope_mm_per_m: f64,
+    /// Mean error of the mark at the place itself, mm.
+    pub at_reference_mm: f64,
     /// The line's value at no distance, mm.
     pub intercept_mm: f64,
     /// Share of the variance that the line explains.
     pub r2: f64,
     /// The line's value at 16 cm, mm.
     pub error_at_16cm_mm: f64,
+    /// Slope of the error of one vector if sight had no error, mm/m.
+    pub exact_slope_mm_per_m: f64,
     /// Slope of the tip's error with the field made from looks at the mark, mm/m.
     pub field_slope_mm_per_m: f64,
     /// Slope of the tip's error with the vector of the mark, mm/m.
@@ -81,6 +88,8 @@ pub struct Reference {
     pub plate_intercept_mm: f64,
     /// Slope that the numeric study of locality predicts, mm/m.
     pub predicted_slope_mm_per_m: f64,
+    /// The value at no distance of that study's line, mm.
+    pub predicted_intercept_mm: f64,
     /// Robots whose fiducial was found at the reference place.
     pub robots: usize,
 }
@@ -92,6 +101,8 @@ pub struct ExperimentPoint {
     pub distance_m: f64,
     /// Mean error of the mark with its vector, mm.
     pub error_mm: f64,
+    /// The same if sight had no error, mm.
+    pub exact_mm: f64,
     /// Mean error of the mark without correction, mm.
     pub open_loop_mm: f64,
     /// Mean error of the tip with the mark's vector, mm.
@@ -102,16 +113,6 @@ pub struct ExperimentPoint {
     pub field_mm: f64,
     /// Robots that reached it.
     pub robots: usize,
-}
-
-/// Errors of one robot at one target, mm.
-#[derive(Clone, Copy, Debug)]
-struct Errors {
-    mark: f64,
-    open_loop: f64,
-    tip: f64,
-    plate: f64,
-    field: f64,
 }
 
 /// The paper's three places, rover frame, in the order of the numeric study.
@@ -135,6 +136,7 @@ fn targets(bed: &Testbed) -> Result<Vec<Vector3<f64>>, StudyError> {
     let pair = bed.robot.pair(PAIR).map_err(failed)?;
     let ready = bed.robot.posture("ready").map_err(failed)?;
     let model = rover_epec_servo::place::error_model(&bed.robot);
+    let model_of_mark = bed.model_of_mark()?;
     let mut found = Vec::new();
     for x in [0.44, 0.52, 0.60, 0.68] {
         for y in [-0.18, -0.06, 0.06, 0.18] {
@@ -148,7 +150,11 @@ fn targets(bed: &Testbed) -> Result<Vec<Vector3<f64>>, StudyError> {
                 let seen = [&pair.cameras.left, &pair.cameras.right]
                     .iter()
                     .all(|c| c.project_into_image(&at, 60.0).is_ok());
-                if seen && is_visible(&bed.robot, &model, &pair.cameras, &pose, ready) {
+                // And the arm's plate, with the tip there and with its mark there.
+                let arm_is_seen = [&model, &model_of_mark]
+                    .iter()
+                    .all(|m| is_visible(&bed.robot, m, &pair.cameras, &pose, ready));
+                if seen && arm_is_seen {
                     found.push(at);
                 }
             }
@@ -177,12 +183,7 @@ fn places(targets: &[Vector3<f64>]) -> Result<Vec<Vector3<f64>>, StudyError> {
 /// # Errors
 /// [`StudyError`].
 pub fn experiment(config: &StudyConfig) -> Result<Experiment, StudyError> {
-    // Calibrated cameras are never exact; the paper names that as what steepens the slope.
-    let intrinsics = IntrinsicsError {
-        focal_fraction: 1e-3,
-        principal_point_px: 0.3,
-    };
-    let bed = Testbed::bluestreak(intrinsics)?;
+    let bed = Testbed::bluestreak(INTRINSICS)?;
     let targets = targets(&bed)?;
     let places = places(&targets)?;
     let theory = locality(&config.with_trials(THEORY_TRIALS.min(3 * config.trials)))?;
@@ -202,124 +203,16 @@ pub fn experiment(config: &StudyConfig) -> Result<Experiment, StudyError> {
             reference(place, theory, &targets, &of_robots)
         })
         .collect::<Result<_, _>>()?;
+    let middle = places
+        .first()
+        .ok_or(StudyError::NoTrials { what: "experiment" })?;
+    let at_reference = pool.install(|| sources::at_reference(config, &bed, middle))?;
     Ok(Experiment {
         seed: config.seed,
         trials: config.trials,
-        intrinsics: (intrinsics.focal_fraction, intrinsics.principal_point_px),
+        intrinsics: (INTRINSICS.focal_fraction, INTRINSICS.principal_point_px),
         references,
-    })
-}
-
-fn goal(target: &Target, method: Method, observation: Observation, looks: usize) -> PlaceGoal {
-    let last = looks.max(2) - 1;
-    let stations = (0..looks).map(|k| {
-        if looks == 1 {
-            return 0.0;
-        }
-        APPROACH_M * (1.0 - k as f64 / last as f64)
-    });
-    PlaceGoal {
-        target: target.clone(),
-        stations_m: stations.collect(),
-        method,
-        observation,
-        tolerance_m: ANY_M,
-        max_corrections_n: 1,
-        max_predicted_error_m: NO_LIMIT_M,
-    }
-}
-
-/// Errors of one robot: for each reference place one entry per target; none where the fiducial was
-/// not found or the corrected target is out of reach.
-fn one_robot(
-    config: &StudyConfig,
-    bed: &Testbed,
-    places: &[Vector3<f64>],
-    targets: &[Vector3<f64>],
-    trial: u64,
-) -> Result<Vec<Vec<Option<Errors>>>, StudyError> {
-    let seed = super::draws::key(config.seed, &[9, trial]);
-    let mut robot = bed.draw(seed)?;
-    let designated: Vec<Option<Target>> = targets
-        .iter()
-        .map(|at| robot.target(at, &-down()).ok())
-        .collect();
-    let start = robot.start()?;
-    let mut out = Vec::with_capacity(places.len());
-    for place in places {
-        let here = targets.iter().position(|t| t == place);
-        let reference = here.and_then(|i| designated[i].clone());
-        let learnt = reference.and_then(|target| learn(&mut robot, &target).ok());
-        robot.forget();
-        let mut errors = vec![None; targets.len()];
-        if let Some(learnt) = learnt {
-            for ((error, target), at) in errors.iter_mut().zip(&designated).zip(targets) {
-                if let Some(target) = target {
-                    *error = measured(&robot, &learnt, target, at, &start)?;
-                }
-            }
-        }
-        out.push(errors);
-    }
-    Ok(out)
-}
-
-/// What three ways of looking at the reference place make of it: the vector of the mark, the
-/// vector of the plate's pose, the field made from looks at the mark.
-fn learn(robot: &mut Drawn, target: &Target) -> Result<[Compensation; 3], Fault> {
-    let mut with = |method, observation, looks| {
-        let goal = goal(target, method, observation, looks);
-        let placed = robot.place(&goal, EstimatorRules::default())?;
-        if !placed.result.looks.iter().any(|l| l.found) {
-            return Err(Fault::new(
-                "study",
-                "not_seen",
-                "the fiducial was not found",
-            ));
-        }
-        Ok::<_, Fault>(placed.result.compensation)
-    };
-    Ok([
-        with(Method::Epec, Observation::Position, 1)?,
-        with(Method::Epec, Observation::Pose, 1)?,
-        with(Method::EpecField, Observation::Position, LOOKS)?,
-    ])
-}
-
-fn measured(
-    robot: &Drawn,
-    learnt: &[Compensation; 3],
-    target: &Target,
-    at: &Vector3<f64>,
-    near: &[f64],
-) -> Result<Option<Errors>, StudyError> {
-    let apart = |p: Vector3<f64>| (p - at).norm() * 1e3;
-    let of_tip = |compensation: &Compensation| -> Result<Option<f64>, StudyError> {
-        match robot.corrected(compensation, target, near) {
-            Ok(q) => Ok(Some(apart(robot.true_tip(&q)?))),
-            Err(_) => Ok(None),
-        }
-    };
-    let of_mark = |compensation: &Compensation| -> Result<Option<f64>, StudyError> {
-        Ok(robot.placed_mark(compensation, target, near)?.map(apart))
-    };
-    let [mark, plate, field] = learnt;
-    let all = (
-        of_mark(mark)?,
-        of_mark(&Compensation::none())?,
-        of_tip(mark)?,
-        of_tip(plate)?,
-        of_tip(field)?,
-    );
-    Ok(match all {
-        (Some(mark), Some(open_loop), Some(tip), Some(plate), Some(field)) => Some(Errors {
-            mark,
-            open_loop,
-            tip,
-            plate,
-            field,
-        }),
-        _ => None,
+        at_reference,
     })
 }
 
@@ -340,6 +233,7 @@ fn reference(
         points.push(ExperimentPoint {
             distance_m: (at - place).norm(),
             error_mm: averaged(|e| e.mark),
+            exact_mm: averaged(|e| e.exact),
             open_loop_mm: averaged(|e| e.open_loop),
             tip_mm: averaged(|e| e.tip),
             plate_mm: averaged(|e| e.plate),
@@ -356,6 +250,7 @@ fn reference(
             .collect();
         Line::fit(&fitted).ok_or_else(none)
     };
+    let at_reference = points.first().filter(|p| p.distance_m < 1e-9);
     let vector = line(|p| p.error_mm)?;
     let tip = line(|p| p.tip_mm)?;
     let plate = line(|p| p.plate_mm)?;
@@ -363,63 +258,21 @@ fn reference(
         name: theory.name,
         position_m: (*place).into(),
         slope_mm_per_m: vector.slope,
+        at_reference_mm: at_reference.ok_or_else(none)?.error_mm,
         intercept_mm: vector.intercept,
         r2: vector.r2,
         error_at_16cm_mm: vector.at(0.16),
+        exact_slope_mm_per_m: line(|p| p.exact_mm)?.slope,
         field_slope_mm_per_m: line(|p| p.field_mm)?.slope,
         tip_slope_mm_per_m: tip.slope,
         tip_intercept_mm: tip.intercept,
         plate_slope_mm_per_m: plate.slope,
         plate_intercept_mm: plate.intercept,
         predicted_slope_mm_per_m: theory.slope_mm_per_m,
+        predicted_intercept_mm: theory.intercept_mm,
         robots: points.iter().map(|p| p.robots).max().unwrap_or(0),
         points,
     })
-}
-
-impl Experiment {
-    /// What the study says, from its own numbers.
-    pub fn verdict(&self) -> String {
-        let range = |of: &dyn Fn(&Reference) -> f64| {
-            let values = self.references.iter().map(of);
-            values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), x| {
-                (a.min(x), b.max(x))
-            })
-        };
-        let points = || self.references.iter().flat_map(|r| &r.points);
-        let open = mean(&points().map(|p| p.open_loop_mm).collect::<Vec<_>>());
-        let worse = points().filter(|p| p.error_mm > p.open_loop_mm).count();
-        let (low, high) = range(&|r| r.slope_mm_per_m);
-        let (theory_low, theory_high) = range(&|r| r.predicted_slope_mm_per_m);
-        let (r2, _) = range(&|r| r.r2);
-        let (near, far) = range(&|r| r.error_at_16cm_mm);
-        let (tip_low, tip_high) = range(&|r| r.tip_intercept_mm);
-        let (plate_low, plate_high) = range(&|r| r.plate_intercept_mm);
-        let (_, field) = range(&|r| r.field_slope_mm_per_m / r.tip_slope_mm_per_m);
-        let steeper = self
-            .references
-            .iter()
-            .filter(|r| r.slope_mm_per_m > r.predicted_slope_mm_per_m)
-            .count();
-        format!(
-            "As in the paper's figure 7: without correction the error is much the same everywhere \
-             ({open:.1} mm on average); with a vector taken elsewhere it grows with the distance \
-             by {low:.0} to {high:.0} mm per metre (the line explains at least {:.0} % of the \
-             variance), where the numeric study predicts {theory_low:.0} to {theory_high:.0}; \
-             it is steeper than predicted at {steeper} of {} places. At 16 cm it is \
-             {near:.1} to {far:.1} mm. Correction was worse than none at {worse} of {} targets. \
-             That is the fiducial's mark, brought to the target itself. For the instrument's tip the \
-             line begins at {tip_low:.1} to {tip_high:.1} mm with the same vector, because the \
-             direction of the tool is not corrected, and at {plate_low:.1} to {plate_high:.1} mm \
-             with the pose of the plate, whose range comes from the plate's size, too, so that the \
-             cameras' errors are not the same for target and fiducial. The tip's error with the \
-             field made from six looks on a straight 12 cm grows at most {field:.2} times as fast \
-             as with one vector.",
-            r2 * 100.0,
-            self.references.len(),
-            points().count(),
-        )
-    }
 }
 
 #[cfg(test)]
@@ -444,7 +297,7 @@ mod tests {
         for r in &study.references {
             let near = r.points.first().unwrap();
             assert!(
-                near.distance_m < 1e-9 && near.error_mm < 0.5 * near.open_loop_mm,
+                near.distance_m < 1e-9 && near.error_mm < 0.2 * near.open_loop_mm,
                 "{}: {near:?}",
                 r.name
             );
@@ -457,5 +310,20 @@ mod tests {
                 r.name
             );
         }
+        // What remains at the place itself is the rule's own remainder: it is there with exact
+        // sight, too, and a second vector takes it away but for what pictures and lenses add.
+        let at = |name| {
+            study
+                .at_reference
+                .iter()
+                .find(|a| a.setting == name)
+                .unwrap()
+        };
+        let (all, exact) = (at(sources::EVERYTHING), at(sources::EXACT_SIGHT));
+        assert!(exact.mark_mm < 0.2 * exact.open_loop_mm, "{exact:?}");
+        assert!(exact.mark_second_mm < 0.25, "{exact:?}");
+        assert!(all.mark_second_mm < 0.8, "{all:?}");
+        let lenses = at(sources::EXACT_LENSES);
+        assert!((lenses.mark_mm - exact.mark_mm).abs() < 0.5, "{lenses:?}");
     }
 }

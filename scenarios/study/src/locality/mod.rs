@@ -1,6 +1,8 @@
 //! How far from the target the error vector may be taken (the paper's section 5, *Locality of
 //! Correction Vector*, figure 6), and how much further the field with a kinematic prior carries.
 
+mod field;
+
 use super::{
     StudyConfig, StudyError,
     draws::Draws,
@@ -8,7 +10,8 @@ use super::{
     workspace::{LEVELS, TARGETS, targets, usual_posture},
     world::{TrueRobot, believed},
 };
-use nalgebra::{DMatrix, DVector, Matrix3, Matrix3xX, Vector3};
+use field::{Approach, Field};
+use nalgebra::{DVector, Matrix3, Vector3};
 use rayon::prelude::*;
 use rover_compensation::ErrorModel;
 use rover_kinematics::{AxisGoal, closest_solution};
@@ -24,6 +27,8 @@ const LOOKS: usize = 6;
 const LEAST_NOISE_M: f64 = 2e-5;
 /// Noise of one seen position in the noisy variant, m.
 const NOISE_M: f64 = 0.3e-3;
+/// Middle of the workspace, x, m.
+const MIDDLE_X_M: f64 = 0.505;
 /// 95 % of the squared length of a three-dimensional standard normal vector.
 const CHI2_3_95: f64 = 7.814_727_9;
 
@@ -118,7 +123,10 @@ pub fn locality(config: &StudyConfig) -> Result<Locality, StudyError> {
 fn places(goals: &[AxisGoal]) -> Result<Vec<(&'static str, AxisGoal)>, StudyError> {
     // The field of view's axis looks 45 degrees down from 0.3 m above the base.
     let wanted = [
-        ("centre of the workspace", Vector3::new(0.505, 0.0, 0.12)),
+        (
+            "centre of the workspace",
+            Vector3::new(MIDDLE_X_M, 0.0, 0.12),
+        ),
         ("centre of the field of view", Vector3::new(0.45, 0.0, 0.15)),
         ("far edge of the workspace", Vector3::new(0.66, 0.34, 0.30)),
     ];
@@ -137,113 +145,6 @@ fn places(goals: &[AxisGoal]) -> Result<Vec<(&'static str, AxisGoal)>, StudyErro
                 })
         })
         .collect()
-}
-
-/// The way on which the field's vectors are seen.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Approach {
-    /// The last 12 cm along the tool.
-    Straight,
-    /// From a neutral place 20 cm above and as far towards the middle, bending down.
-    Bent,
-}
-
-impl Approach {
-    /// Offset from the goal with a share `t` of the way left.
-    fn offset(self, goal: &AxisGoal, t: f64) -> Vector3<f64> {
-        match self {
-            Self::Straight => goal.axis.into_inner() * (-0.12 * t),
-            Self::Bent => {
-                let inward = if goal.point.y > 0.0 { -1.0 } else { 1.0 };
-                Vector3::new(
-                    -0.12 * t,
-                    inward * 0.20 * t * t,
-                    -0.20 * t * (3.0 - 2.0 * t),
-                )
-            }
-        }
-    }
-}
-
-/// The field of one approach: what it makes of the vectors seen is linear in them and, for
-/// commands that do not depend on the draw, the same for every draw.
-struct Field {
-    looks: Vec<Vec<f64>>,
-    last: Matrix3xX<f64>,
-    /// Parameters from the stacked vectors.
-    gain: DMatrix<f64>,
-    covariance: DMatrix<f64>,
-    noise_m: f64,
-}
-
-/// Rows of the error model's Jacobian for the tip's position.
-fn rows(model: &ErrorModel, q: &[f64]) -> Result<Matrix3xX<f64>, StudyError> {
-    let jacobian = model.pose_jacobian(q, &model.tool.tip_in_link)?;
-    Ok(jacobian.fixed_rows::<3>(0).into_owned())
-}
-
-impl Field {
-    /// Looks along the way to `goal`, those that are within reach.
-    fn new(
-        model: &ErrorModel,
-        goal: &AxisGoal,
-        way: Approach,
-        noise_m: f64,
-    ) -> Result<Self, StudyError> {
-        let level = &LEVELS[2];
-        let mut looks = Vec::new();
-        for k in 0..LOOKS {
-            let left = 1.0 - k as f64 / (LOOKS - 1) as f64;
-            let station = AxisGoal {
-                point: goal.point + way.offset(goal, left),
-                axis: goal.axis,
-            };
-            looks.extend(usual_posture(&model.arm, &station));
-        }
-        let n = model.parameter_count();
-        let arm_columns = n - 6;
-        let sigma = DVector::from_fn(n, |i, _| match i {
-            i if i < arm_columns && (i % 4 == 1 || i % 4 == 2) => level.length_m(),
-            i if i >= arm_columns + 3 => level.length_m(),
-            _ => level.angle_rad(),
-        });
-        let prior = DMatrix::from_diagonal(&sigma.component_mul(&sigma));
-        let mut h = DMatrix::zeros(3 * looks.len(), n);
-        for (k, q) in looks.iter().enumerate() {
-            h.rows_mut(3 * k, 3).copy_from(&rows(model, q)?);
-        }
-        let noise = DMatrix::identity(h.nrows(), h.nrows()) * noise_m.powi(2);
-        let spread = &h * &prior * h.transpose() + noise;
-        let factor = spread.cholesky().ok_or(StudyError::NoTrials {
-            what: "locality: the field's observations are degenerate",
-        })?;
-        let gain = factor.solve(&(&h * &prior)).transpose();
-        let covariance = &prior - &gain * &h * &prior;
-        let last = looks.last().map(|q| rows(model, q)).transpose()?;
-        Ok(Self {
-            last: last.ok_or(StudyError::NoTrials { what: "locality" })?,
-            looks,
-            gain,
-            covariance,
-            noise_m,
-        })
-    }
-
-    /// Predicted minus last vector and its covariance at `q`: anchored on the last vector, so
-    /// that only the difference comes from the parameters.
-    fn beyond_last(
-        &self,
-        model: &ErrorModel,
-        q: &[f64],
-        parameters: &DVector<f64>,
-    ) -> Result<(Vector3<f64>, Matrix3<f64>), StudyError> {
-        let change = rows(model, q)? - &self.last;
-        let step = &change * parameters;
-        let spread = &change * &self.covariance * change.transpose();
-        let spread = Matrix3::from_column_slice(spread.as_slice())
-            + Matrix3::identity() * self.noise_m.powi(2);
-        Ok((Vector3::new(step[0], step[1], step[2]), spread))
-    }
 }
 
 /// Per target: error with one vector, open loop, field, noisy field, its bound; two coverages.
@@ -267,8 +168,9 @@ fn reference(
     name: &'static str,
     source: &AxisGoal,
 ) -> Result<Reference, StudyError> {
-    let exact = Field::new(model, source, Approach::Bent, LEAST_NOISE_M)?;
-    let noisy = Field::new(model, source, Approach::Bent, NOISE_M)?;
+    let bent = Approach::bent_in_view(source);
+    let exact = Field::new(model, source, bent, LEAST_NOISE_M)?;
+    let noisy = Field::new(model, source, bent, NOISE_M)?;
     let straight = Field::new(model, source, Approach::Straight, LEAST_NOISE_M)?;
     let postures: Vec<Vec<f64>> = goals
         .iter()
@@ -438,8 +340,8 @@ impl Locality {
              it must read .5 cm, 5 mm. With six vectors seen along a bent approach the field with a \
              kinematic prior grows at most {field:.2} times as fast, {noisy:.2} times when each \
              vector has 0.3 mm of noise, and its 95 % ellipsoids held the true vector in at least \
-             {:.0} % of the predictions. That approach is the best of seven shapes tried with seed 1. \
-             A straight one of 12 cm shows less of the robot: the field then grows at most {straight:.2} times as fast as one vector.",
+             {:.0} % of the predictions. The approach's \
+             shape was chosen among some twenty; every look on it is in the cameras' view. A straight one of 12 cm shows less of the robot: the field then grows at most {straight:.2} times as fast as one vector.",
             r2 * 100.0,
             covered * 100.0
         )
@@ -458,14 +360,17 @@ mod tests {
             assert_eq!(study.references.len(), 3);
             for r in &study.references {
                 let (vector, field) = (r.slope_mm_per_m, r.field_slope_mm_per_m);
-                assert!((22.0..42.0).contains(&vector), "{}: {vector}", r.name);
+                let noisy = r.field_noisy_slope_mm_per_m;
+                assert!((25.0..40.0).contains(&vector), "{}: {vector}", r.name);
                 assert!(r.r2 > 0.85, "{}: {}", r.name, r.r2);
                 assert!(
-                    (4.5..8.0).contains(&r.error_at_16cm_mm),
+                    (4.5..7.0).contains(&r.error_at_16cm_mm),
                     "{}",
                     r.error_at_16cm_mm
                 );
-                assert!(field < 0.25 * vector, "{}: {field}", r.name);
+                assert!(field < 0.2 * vector, "{}: {field}", r.name);
+                assert!(noisy < 0.25 * vector, "{}: {noisy}", r.name);
+                assert_eq!(r.looks, LOOKS, "{}", r.name);
             }
         }
     }
