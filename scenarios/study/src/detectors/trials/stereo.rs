@@ -41,8 +41,7 @@ fn plane_pair(rng: &mut ChaCha8Rng, noise_dn: f64, size: (u32, u32)) -> Option<P
     let seed: u64 = rng.random::<u64>() >> 1;
     let shade = move |x: f64, y: f64| Some(texture(x, y, 0.064, 0.0015, 18.0, seed));
     let light = Light::random(rng);
-    let draw =
-        |camera: &Camera| patch::draw(camera, &pose, &shade, &|_, _| 110.0, patch::SMOOTH);
+    let draw = |camera: &Camera| patch::draw(camera, &pose, &shade, &|_, _| 110.0, patch::SMOOTH);
     let pictures = [draw(&pair.left), draw(&pair.right)];
     let clean = patch::expose(&pictures[0], size.0, &light, 0.0, &mut rng.clone())?;
     let left = patch::expose(&pictures[0], size.0, &light, noise_dn, rng)?;
