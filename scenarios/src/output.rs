@@ -55,8 +55,16 @@ impl Output {
     /// # Errors
     /// [`OutputError::File`].
     pub fn write(&self, text: &str) -> Result<(), OutputError> {
+        self.write_bytes(text.as_bytes())
+    }
+
+    /// Writes the whole output, which need not be text.
+    ///
+    /// # Errors
+    /// [`OutputError::File`].
+    pub fn write_bytes(&self, bytes: &[u8]) -> Result<(), OutputError> {
         match self {
-            Self::Stdout => print(text),
+            Self::Stdout => print_bytes(bytes),
             Self::File(path) => {
                 let file = |source| OutputError::File {
                     path: path.display().to_string(),
@@ -65,7 +73,7 @@ impl Output {
                 if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
                     std::fs::create_dir_all(folder).map_err(file)?;
                 }
-                std::fs::write(path, text).map_err(file)
+                std::fs::write(path, bytes).map_err(file)
             }
         }
     }
@@ -76,11 +84,12 @@ impl Output {
 /// # Errors
 /// [`OutputError::File`].
 pub fn print(text: &str) -> Result<(), OutputError> {
+    print_bytes(text.as_bytes())
+}
+
+fn print_bytes(bytes: &[u8]) -> Result<(), OutputError> {
     let mut stdout = io::stdout().lock();
-    match stdout
-        .write_all(text.as_bytes())
-        .and_then(|()| stdout.flush())
-    {
+    match stdout.write_all(bytes).and_then(|()| stdout.flush()) {
         Err(e) if e.kind() == io::ErrorKind::BrokenPipe => Ok(()),
         other => other.map_err(|source| OutputError::File {
             path: "standard output".into(),

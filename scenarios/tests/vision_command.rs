@@ -245,6 +245,116 @@ fn pixels_are_matched_triangulated_and_their_surface_measured() {
 }
 
 #[test]
+fn the_disparity_image_has_the_planes_depth_and_marks_what_it_does_not_know() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let normal = Vector3::new(0.1, 0.4, -1.0).normalize();
+    let rock = |x: f64, y: f64| texture(x, y, 0.06, 0.003, 25.0, 9);
+    for (side, x) in [("left", 0.0), ("right", 0.06)] {
+        let image = photograph(&camera(x), normal, &rock);
+        write(at, &format!("{side}.png"), &image);
+        model(at, &format!("{side}.cahv"), &camera(x));
+    }
+    let flat = Image8::from_raw(320, 240, vec![90; 320 * 240]).unwrap();
+    write(at, "flat.png", &flat);
+    let models = ["--left-model", "left.cahv", "--right-model", "right.cahv"];
+    let ask = |images: [&str; 2], more: &[&str]| {
+        rover(
+            at,
+            &[&["disparity"], &images[..], &models[..], more].concat(),
+        )
+    };
+    let ranges = ["--range-min-m", "0.35", "--range-max-m", "1.2"];
+    let out = ask(
+        ["left.png", "right.png"],
+        &[&ranges[..], &["-o", "d.csv", "--json", "-"]].concat(),
+    );
+    assert_eq!(out.status.code(), Some(0), "{}", text(&out.stderr));
+    let summary = json(&out);
+    assert!((summary["disparity_depth_px_m"].as_f64().unwrap() - 24.0).abs() < 1e-6);
+    assert!(
+        summary["found_percent"].as_f64().unwrap() > 50.0,
+        "{summary}"
+    );
+
+    let table = std::fs::read_to_string(at.join("d.csv")).unwrap();
+    let mut lines = table.lines();
+    assert_eq!(
+        lines.next(),
+        Some("u_px,v_px,disparity_px,x_m,y_m,z_m,status")
+    );
+    let aside = 159.5 - summary["rectified_left"]["h"][2].as_f64().unwrap();
+    let (mut found, mut all, mut off) = (0u64, 0, Vec::new());
+    let mut disparities = Vec::new();
+    for line in lines {
+        let cells: Vec<&str> = line.split(',').collect();
+        let pixel = [all % 320, all / 320].map(|x| x.to_string());
+        assert_eq!(cells[..2], pixel[..], "{line}");
+        all += 1;
+        if cells[6..] != ["ok"] {
+            assert_eq!(cells[2..6], [""; 4], "{line}");
+            assert!(cells[6].len() > 10, "{line}");
+            disparities.push(None);
+            continue;
+        }
+        found += 1;
+        let number = |k: usize| cells[k].parse::<f64>().unwrap();
+        // the cameras are parallel: rectified and taken pixels are alike
+        let ray = camera(0.0)
+            .ray(&Vector2::new(number(0), number(1)))
+            .unwrap();
+        let plane = Vector3::new(0.0, 0.0, 0.6);
+        let depth = ray
+            .at(normal.dot(&plane) / normal.dot(ray.direction.as_ref()))
+            .z;
+        off.push((number(2) - 24.0 / depth).abs());
+        assert!((number(5) - 24.0 / number(2)).abs() < 1e-9, "{line}");
+        disparities.push(Some(number(2)));
+    }
+    assert_eq!((all, summary["found"].as_u64()), (320 * 240, Some(found)));
+    off.sort_by(f64::total_cmp);
+    let (median, most) = (off[off.len() / 2], off[off.len() * 99 / 100]);
+    assert!(median < 0.1 && most < 0.5, "{median} {most}");
+
+    // the same as a picture: 64 steps per px, 0 for no answer
+    let png = [&ranges[..], &["--out", "d.png"]].concat();
+    let out = ask(["left.png", "right.png"], &png);
+    assert_eq!(out.status.code(), Some(0), "{}", text(&out.stderr));
+    let picture = image::open(at.join("d.png")).unwrap();
+    let image::DynamicImage::ImageLuma16(picture) = picture else {
+        panic!("not a 16-bit grey image");
+    };
+    for (pixel, disparity) in picture.pixels().zip(&disparities) {
+        let steps = disparity.map_or(0, |d| (d * 64.0) as u16);
+        assert_eq!(pixel.0[0], steps);
+    }
+
+    let out = ask(
+        ["flat.png", "flat.png"],
+        &["-o", "-", "--json", "flat.json"],
+    );
+    assert_eq!(out.status.code(), Some(3), "{}", text(&out.stderr));
+    assert!(
+        text(&out.stdout)
+            .lines()
+            .nth(1)
+            .unwrap()
+            .starts_with("0,0,,,,,no match")
+    );
+    let refusals: [(&[&str], &str); 4] = [
+        (&["-o", "d.tiff"], ".png"),
+        (&["-o", "d.png"], "--force"),
+        (&["-o", "-", "--json", "-"], "standard output"),
+        (&["-o", "e.png", "--range-min-m", "0.01"], "256"),
+    ];
+    for (more, why) in refusals {
+        let out = ask(["left.png", "right.png"], more);
+        assert_eq!(out.status.code(), Some(2), "{more:?}");
+        assert!(text(&out.stderr).contains(why), "{}", text(&out.stderr));
+    }
+}
+
+#[test]
 fn bad_input_ends_with_2_and_names_what_is_wrong() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
@@ -326,6 +436,7 @@ fn bad_input_ends_with_2_and_names_what_is_wrong() {
     );
     refused(&["evaluate", "--only", "discs"], &["discs", "disc"]);
     refused(&["evaluate", "--patches", "0"], &["--patches"]);
+    refused(&["evaluate", "--noise", "99"], &["--noise"]);
 }
 
 #[test]

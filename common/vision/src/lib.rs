@@ -29,8 +29,8 @@ pub use fiducial::{
 pub use image::{Image8, ImageError, ImageF, encode_png};
 pub use plate::{Disc, LayoutError, PlateLayout, Saddle};
 pub use stereo::{
-    DenseError, DenseRules, Disparity, MatchFailure, MatchRules, PlaneFailure, PlaneRules,
-    PreparedImage, Rectifier, RectifyError, StereoMatch, StereoPlane, Surface, SurfaceFailure,
-    SurfacePlane, SurfaceRules, dense_disparity, match_point, measure_distant_surface,
-    measure_plane, measure_surface, sparse_points,
+    DenseError, DenseRules, Disparity, MatchFailure, MatchRules, PairDisparityError, PlaneFailure,
+    PlaneRules, PreparedImage, Rectifier, RectifyError, StereoMatch, StereoPlane, Surface,
+    SurfaceFailure, SurfacePlane, SurfaceRules, dense_disparity, match_point,
+    measure_distant_surface, measure_plane, measure_surface, sparse_points,
 };

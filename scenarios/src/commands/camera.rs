@@ -2,7 +2,7 @@
 
 mod calibrate;
 mod convert;
-mod files;
+pub(super) mod files;
 mod info;
 mod points;
 

@@ -1,5 +1,6 @@
 //! `rover vision`: fiducials and stereo on a person's own images.
 
+mod disparity;
 mod evaluate;
 mod find;
 mod input;
@@ -10,7 +11,7 @@ use super::{CommandError, Exit};
 /// Finds fiducials, matches pixels and measures surfaces in images of one's own
 ///
 /// Images are PNG or PGM, 8 or 16 bit; colour is converted to grey. Pixel (0, 0) is the centre of
-/// the first pixel. Camera models are CAHV text files or TOML. Exit code 3: the images hold no
+/// the first pixel. Camera models are of any format that `rover camera` reads. Exit code 3: the images hold no
 /// answer, and the output says why.
 #[derive(Clone, Debug, clap::Args)]
 pub struct VisionArgs {
@@ -23,6 +24,7 @@ enum Verb {
     Find(Box<find::FindArgs>),
     Match(stereo::MatchArgs),
     Normal(stereo::NormalArgs),
+    Disparity(disparity::DisparityArgs),
     Evaluate(evaluate::EvaluateArgs),
 }
 
@@ -35,6 +37,7 @@ pub async fn run(args: VisionArgs) -> Result<Exit, CommandError> {
         Verb::Find(args) => find::run(&args),
         Verb::Match(args) => stereo::run_match(&args),
         Verb::Normal(args) => stereo::run_normal(&args),
+        Verb::Disparity(args) => disparity::run(&args),
         Verb::Evaluate(args) => evaluate::run(&args),
     }
 }

@@ -11,7 +11,7 @@ use rover_cameras::Camera;
 use serde::{Deserialize, Serialize};
 
 use super::blobs::{Blob, BlobRules, blobs};
-use super::pixels::{FitRules, PixelModel, fit_pixels, noise_dn};
+use super::pixels::{PixelModel, fit_pixels, fit_rules, noise_dn};
 use super::{Finding, NoFinding, distinct, positive};
 use crate::fiducial::normal_at;
 use crate::image::Image8;
@@ -328,16 +328,7 @@ fn fit(
         &model,
         contrast_dn,
         noise_dn,
-        &FitRules {
-            min_contrast_dn: rules.min_contrast_dn,
-            max_blur_px: rules.max_blur_px.min(0.5 * short),
-            min_score: rules.min_score,
-            max_residual_fraction: rules.max_residual_fraction,
-            noise_dn: rules.noise_dn,
-            max_saturated_fraction: rules.max_saturated_fraction,
-            max_sigma_px: rules.max_sigma_px,
-            sigma_floor_px: rules.sigma_floor_px,
-        },
+        &fit_rules!(rules, rules.max_blur_px.min(0.5 * short)),
     )?;
     let mut centre = [p[0], p[1]];
     if let Some(truth) = truth {

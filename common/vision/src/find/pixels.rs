@@ -65,6 +65,23 @@ pub(super) struct FitRules {
     pub sigma_floor_px: f64,
 }
 
+/// [`FitRules`] from the fields of the same names of a detector's rules, with its limit of the blur.
+macro_rules! fit_rules {
+    ($rules:expr, $max_blur_px:expr) => {
+        $crate::find::pixels::FitRules {
+            min_contrast_dn: $rules.min_contrast_dn,
+            max_blur_px: $max_blur_px,
+            min_score: $rules.min_score,
+            max_residual_fraction: $rules.max_residual_fraction,
+            noise_dn: $rules.noise_dn,
+            max_saturated_fraction: $rules.max_saturated_fraction,
+            max_sigma_px: $rules.max_sigma_px,
+            sigma_floor_px: $rules.sigma_floor_px,
+        }
+    };
+}
+pub(super) use fit_rules;
+
 /// A shape passes with deformations up to this multiple of what noise and the granted deformation
 /// explain: with a dozen deformations the shape itself exceeds it once in some ten thousand.
 const MAX_DEFORMATION: f64 = 1.8;

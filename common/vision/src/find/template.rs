@@ -221,23 +221,7 @@ fn refine(
     let corner = Vector2::new(f64::from(left), f64::from(top));
     let scale = 1.0 / half_u.max(half_v).max(1.0);
 
-    // slopes by u, v and the four affine elements, then value, one and a ramp of light (x, y),
-    // where the patch has them
-    let on = |i: usize, j: usize| patch.mask.as_ref().is_none_or(|m| m[j * w + i]);
-    let mut rows: Vec<(usize, SVector<f64, 10>)> = Vec::with_capacity(w * h);
-    for j in 1..h.saturating_sub(1) {
-        for i in 1..w.saturating_sub(1) {
-            if !(on(i, j) && on(i - 1, j) && on(i + 1, j) && on(i, j - 1) && on(i, j + 1)) {
-                continue;
-            }
-            let at = |i: usize, j: usize| f64::from(patch.values[j * w + i]);
-            let gu = 0.5 * (at(i + 1, j) - at(i - 1, j));
-            let gv = 0.5 * (at(i, j + 1) - at(i, j - 1));
-            let (x, y) = ((i as f64 - half_u) * scale, (j as f64 - half_v) * scale);
-            let row = [gu, gv, gu * x, gu * y, gv * x, gv * y, at(i, j), 1.0, x, y];
-            rows.push((j * w + i, SVector::from(row)));
-        }
-    }
+    let Slopes { rows, inflation } = slopes(patch, scale, noises_dn[1]);
     let mut normal = SMatrix::<f64, 10, 10>::zeros();
     for (_, row) in &rows {
         normal.ger(1.0, row, row, 1.0);
@@ -343,7 +327,7 @@ fn refine(
             let inverse = factor.inverse();
             let spread = 0.5 * (inverse[(0, 0)] + inverse[(1, 1)]);
             // the template carries noise of its own: both images count
-            let sigma = (residual.max(0.08) * spread).sqrt() / gain;
+            let sigma = (residual.max(0.08) * spread).sqrt() / gain * inflation;
             let floor = rules.sigma_floor_px;
             let at = centre + matrix * patch.offset;
             return Ok(Finding::at(
@@ -358,6 +342,85 @@ fn refine(
         moved_px: (centre - start).norm(),
         limit_px: rules.max_correction_px,
     })
+}
+
+/// The picture's part of the fit.
+struct Slopes {
+    /// By pixel of the patch: derivatives by u, v and the four affine elements, then value, one and
+    /// a ramp of light (x, y).
+    rows: Vec<(usize, SVector<f64, 10>)>,
+    /// What the noise in the derivatives adds to the standard deviation, as a factor.
+    inflation: f64,
+}
+
+/// Noise of the central difference, (f(1) - f(-1)) / 2, in squares of the pixels' noise; of the same
+/// averaged over three lines with weights 1, 2, 1; and what both have in common.
+const PLAIN_NOISE: f64 = 0.5;
+const SMOOTH_NOISE_IN_COMMON: f64 = 0.25;
+/// Part of the squared derivatives that noise may make up before they are averaged across.
+const NOISY: f64 = 0.2;
+
+/// Derivatives of the picture where it and its neighbours are. With g the true derivative and d the
+/// noisy one that the fit uses, its variance is that of exact derivatives times
+/// (d.d)(g.g) / (d.g)^2: noise in d not only weakens it but lets the normal equations, which hold
+/// d.d, promise too much.
+fn slopes(patch: &Patch, scale: f64, noise_dn: f64) -> Slopes {
+    let (w, h) = (patch.width, patch.height);
+    let (half_u, half_v) = ((w as f64 - 1.0) / 2.0, (h as f64 - 1.0) / 2.0);
+    let on = |i: usize, j: usize| patch.mask.as_ref().is_none_or(|m| m[j * w + i]);
+    let at = |i: usize, j: usize| f64::from(patch.values[j * w + i]);
+    let plain = |i: usize, j: usize| {
+        let gu = 0.5 * (at(i + 1, j) - at(i - 1, j));
+        let gv = 0.5 * (at(i, j + 1) - at(i, j - 1));
+        (gu, gv)
+    };
+    let smooth = |i: usize, j: usize| {
+        let gu = |j: usize| at(i + 1, j) - at(i - 1, j);
+        let gv = |i: usize| at(i, j + 1) - at(i, j - 1);
+        (
+            0.125 * (gu(j - 1) + 2.0 * gu(j) + gu(j + 1)),
+            0.125 * (gv(i - 1) + 2.0 * gv(i) + gv(i + 1)),
+        )
+    };
+    let mut places = Vec::with_capacity(w * h);
+    for j in 1..h.saturating_sub(1) {
+        for i in 1..w.saturating_sub(1) {
+            if on(i, j) && on(i - 1, j) && on(i + 1, j) && on(i, j - 1) && on(i, j + 1) {
+                places.push((i, j));
+            }
+        }
+    }
+    let square = |(a, b): (f64, f64)| a * a + b * b;
+    let plain_square: f64 = places.iter().map(|&(i, j)| square(plain(i, j))).sum();
+    let noise = 2.0 * places.len() as f64 * noise_dn * noise_dn;
+    let is_noisy = PLAIN_NOISE * noise > NOISY * plain_square;
+    let (mut own, mut common) = (0.0, 0.0);
+    let mut rows = Vec::with_capacity(places.len());
+    for (i, j) in places {
+        let exact = plain(i, j);
+        // a picture with a mask is warped, which has averaged it already
+        let used = if is_noisy && patch.mask.is_none() {
+            smooth(i, j)
+        } else {
+            exact
+        };
+        own += square(used);
+        common += used.0 * exact.0 + used.1 * exact.1;
+        let (gu, gv) = used;
+        let (x, y) = ((i as f64 - half_u) * scale, (j as f64 - half_v) * scale);
+        let row = [gu, gv, gu * x, gu * y, gv * x, gv * y, at(i, j), 1.0, x, y];
+        rows.push((j * w + i, SVector::from(row)));
+    }
+    let shared = if is_noisy && patch.mask.is_none() {
+        SMOOTH_NOISE_IN_COMMON
+    } else {
+        PLAIN_NOISE
+    };
+    let signal = (common - shared * noise).max((1.0 - MOST_NOISE) * common);
+    Slopes {
+        rows,
+        inflation: if signal > 0.0 { own / signal } else { 1.0 },
+    }
 }
 
 /// Noise is never held responsible for more than this part of a window's variance.

@@ -1,5 +1,10 @@
 //! Sums of products, the same on every vector unit.
 
+#[cfg(target_arch = "x86_64")]
+use super::{
+    LANES,
+    narrow::{self, POSITIONS, WIDE_POSITIONS},
+};
 use super::{SearchImage, Template};
 
 /// Sums of products of the template with the image at positions `x..x + out.len()` of row `y`.
@@ -19,7 +24,17 @@ pub(super) fn dots(template: &Template, image: &SearchImage, x: usize, y: usize,
     let start = y * image.stride + x;
     #[cfg(target_arch = "x86_64")]
     {
-        if std::arch::is_x86_feature_detected!("avx2") {
+        let (is_narrow, wide) = (
+            template.stride == LANES,
+            std::arch::is_x86_feature_detected!("avx2"),
+        );
+        if is_narrow && wide && out.len() >= WIDE_POSITIONS {
+            // SAFETY: AVX2 is there, and the assertion covers every read.
+            unsafe { narrow::dots_avx2(template, image, start, out) };
+        } else if is_narrow && out.len() >= POSITIONS {
+            // SAFETY: SSE2 belongs to every x86-64, and the assertion covers every read.
+            unsafe { narrow::dots_sse2(template, image, start, out) };
+        } else if wide {
             // SAFETY: AVX2 is there, and the assertion covers every read.
             unsafe { dots_avx2(template, image, start, out) };
         } else {

@@ -6,9 +6,11 @@
 //! work.
 
 mod dots;
+mod narrow;
 mod pyramid;
 mod score;
 mod search_image;
+mod small;
 mod template;
 
 pub use pyramid::{Peak, TemplatePyramid, Window, search, search_peaks};

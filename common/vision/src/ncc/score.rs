@@ -1,6 +1,7 @@
 //! Scores over a range of positions, and their peaks.
 
 use super::dots::dots;
+use super::small::{self, Extent, Scale};
 use super::{FLAT_DN, SCALE, SearchImage, Template};
 
 /// Scores for template positions: the template's first pixel at column `left + i`, row `top + j`
@@ -225,18 +226,38 @@ pub fn score_map(
     let covered_columns = width + template.width - 1;
     let covered_rows = height + template.height - 1;
     let mut scores = Vec::with_capacity(width * height);
+    let n = template.count as f64;
+    let scale = Scale {
+        n,
+        mean: template.mean,
+        inverse_norm: 1.0 / template.norm,
+        flat: (n * (FLAT_DN * f64::from(SCALE)).powi(2)) as f32,
+    };
+    if small::is_small(template) {
+        let extent = Extent {
+            left,
+            top,
+            width,
+            height,
+        };
+        small::scores(image, template, extent, &scale, &mut scores);
+        return Some(ScoreMap {
+            left,
+            top,
+            width,
+            height,
+            scores,
+        });
+    }
     let mut windows = WindowSums {
         sums: vec![0; width],
         squares: vec![0; width],
     };
-    let n = template.count as f64;
     let mut columns_state = (template.rectangular && template.height <= 4000)
         .then(|| ColumnSums::new(image, left, covered_columns, top, template.height));
     let prefix = columns_state
         .is_none()
         .then(|| RowPrefix::new(image, left, covered_columns, top, covered_rows));
-    let flat = (n * (FLAT_DN * f64::from(SCALE)).powi(2)) as f32;
-    let inverse_norm = 1.0 / template.norm;
     let mut products = vec![0i32; width];
     for y in top..top + height {
         if let Some(state) = &mut columns_state {
@@ -256,17 +277,7 @@ pub fn score_map(
             products
                 .iter()
                 .zip(sums)
-                .map(|(&product, (&sum, &square))| {
-                    let sum = sum as f64;
-                    let variance = (square as f64 - sum * sum / n) as f32;
-                    let covariance =
-                        ((f64::from(product) - template.mean * sum) * inverse_norm) as f32;
-                    if variance <= flat {
-                        0.0
-                    } else {
-                        covariance / variance.sqrt()
-                    }
-                }),
+                .map(|(&product, (&sum, &square))| scale.score(product, sum as f64, square as f64)),
         );
     }
     Some(ScoreMap {

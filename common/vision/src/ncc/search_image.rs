@@ -19,7 +19,6 @@ impl SearchImage {
     #[must_use]
     pub fn new(image: &Image8, left: u32, top: u32, width: u32, height: u32, level: u32) -> Self {
         let level = level.min(4);
-        let step = 1usize << level;
         let cut = |start: u32, length: u32, size: u32| {
             (size.min(start.saturating_add(length)).saturating_sub(start)) as usize >> level
         };
@@ -29,39 +28,14 @@ impl SearchImage {
         );
         let stride = w + 2 * LANES;
         let mut values = vec![0i16; stride * h];
-        let source_stride = image.width_px as usize;
-        let mut sums = vec![0u16; w];
-        for y in 0..h {
-            let row_start =
-                |k: usize| (top as usize + y * step + k) * source_stride + left as usize;
-            let out = &mut values[y * stride..y * stride + w];
-            if level == 0 {
-                let row = &image.pixels[row_start(0)..row_start(0) + w];
-                for (o, &p) in out.iter_mut().zip(row) {
-                    *o = i16::from(p) * SCALE as i16 - OFFSET as i16;
-                }
-                continue;
-            }
-            sums.fill(0);
-            for k in 0..step {
-                let row = &image.pixels[row_start(k)..row_start(k) + w * step];
-                match level {
-                    1 => add_groups::<2>(&mut sums, row),
-                    2 => add_groups::<4>(&mut sums, row),
-                    3 => add_groups::<8>(&mut sums, row),
-                    _ => add_groups::<16>(&mut sums, row),
-                }
-            }
-            // 16 x 16 x 255 fits u16; scale to 8 times the mean
-            let shift = 2 * level as i32 - 3;
-            for (o, &s) in out.iter_mut().zip(&sums) {
-                let scaled = if shift >= 0 {
-                    i32::from(s) >> shift
-                } else {
-                    i32::from(s) << -shift
-                };
-                *o = (scaled - OFFSET) as i16;
-            }
+        let source = Source {
+            pixels: &image.pixels,
+            stride: image.width_px as usize,
+            left: left as usize,
+            top: top as usize,
+        };
+        if w > 0 {
+            reduce(&source, (w, level), stride, &mut values);
         }
         Self {
             width: w,
@@ -105,10 +79,68 @@ impl SearchImage {
     }
 }
 
-/// Adds groups of N neighbouring bytes to one sum each.
+/// The part of an image that is reduced.
+struct Source<'a> {
+    pixels: &'a [u8],
+    stride: usize,
+    left: usize,
+    top: usize,
+}
+
+/// Fills rows of `width` values, `stride` apart, with means of 2^level x 2^level pixels.
+fn reduce(source: &Source, size: (usize, u32), stride: usize, values: &mut [i16]) {
+    #[cfg(target_arch = "x86_64")]
+    if std::arch::is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has AVX2.
+        return unsafe { reduce_avx2(source, size, stride, values) };
+    }
+    reduce_plain(source, size, stride, values);
+}
+
+/// The same with wider vectors.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn reduce_avx2(source: &Source, size: (usize, u32), stride: usize, values: &mut [i16]) {
+    reduce_plain(source, size, stride, values);
+}
+
 #[inline(always)]
-fn add_groups<const N: usize>(sums: &mut [u16], row: &[u8]) {
-    for (sum, group) in sums.iter_mut().zip(row.chunks_exact(N)) {
-        *sum += group.iter().map(|&p| u16::from(p)).sum::<u16>();
+fn reduce_plain(source: &Source, (width, level): (usize, u32), stride: usize, values: &mut [i16]) {
+    let step = 1usize << level;
+    let mut columns = vec![0u16; width * step];
+    for (y, out) in values.chunks_exact_mut(stride).enumerate() {
+        let row = |k: usize| {
+            let start = (source.top + y * step + k) * source.stride + source.left;
+            &source.pixels[start..start + width * step]
+        };
+        let out = &mut out[..width];
+        if level == 0 {
+            for (o, &p) in out.iter_mut().zip(row(0)) {
+                *o = i16::from(p) * SCALE as i16 - OFFSET as i16;
+            }
+            continue;
+        }
+        columns.fill(0);
+        for k in 0..step {
+            for (c, &p) in columns.iter_mut().zip(row(k)) {
+                *c += u16::from(p);
+            }
+        }
+        match level {
+            1 => add_groups::<2>(&columns, out, |s| s << 1),
+            2 => add_groups::<4>(&columns, out, |s| s >> 1),
+            3 => add_groups::<8>(&columns, out, |s| s >> 3),
+            _ => add_groups::<16>(&columns, out, |s| s >> 5),
+        }
+    }
+}
+
+/// Adds groups of N neighbouring columns, whose sums (up to 16 x 16 x 255) fit u16, and `scale`s
+/// them to [`SCALE`] times the mean.
+#[inline(always)]
+fn add_groups<const N: usize>(columns: &[u16], out: &mut [i16], scale: impl Fn(u16) -> u16) {
+    for (o, group) in out.iter_mut().zip(columns.chunks_exact(N)) {
+        let sum: u16 = group.iter().sum();
+        *o = scale(sum) as i16 - OFFSET as i16;
     }
 }

@@ -151,6 +151,46 @@ fn vector_units_give_the_same_sums() {
             // SAFETY: `dots` has just checked the same positions.
             unsafe { dots_sse2(&template, &image, 5 * image.stride, &mut fast) };
             assert_eq!(fast, plain);
+            if width <= LANES {
+                fast.fill(0);
+                // SAFETY: as above, and there are more positions than a step has.
+                unsafe {
+                    narrow::dots_sse2(&template, &image, 5 * image.stride, &mut fast);
+                }
+                assert_eq!(fast, plain);
+            }
+        }
+    }
+}
+
+#[test]
+fn short_and_long_sums_give_the_same_scores_to_the_last_bit() {
+    let image = SearchImage::whole(&noise(120, 90, 8), 0);
+    let mut rng = ChaCha8Rng::seed_from_u64(9);
+    for (width, height) in [(7usize, 7usize), (15, 15), (31, 31), (3, 40), (40, 3)] {
+        let values: Vec<f32> = (0..width * height)
+            .map(|_| rng.random_range(0.0..9.0))
+            .collect();
+        let template = Template::new(width, height, &values, None).unwrap();
+        assert!(small::is_small(&template));
+        // with a mask that hides nothing but is told as runs of pixels, the sums are 64 bits long
+        let mut long = template.clone();
+        long.rectangular = false;
+        long.spans = (0..height)
+            .map(|row| template::Span {
+                row,
+                start: 0,
+                end: width,
+            })
+            .collect();
+        assert!(!small::is_small(&long));
+        for (left, top, columns, rows) in [(0, 0, 200, 200), (5, 9, 9, 4), (60, 30, 17, 3)] {
+            let [a, b] =
+                [&template, &long].map(|t| score_map(&image, t, left, top, columns, rows).unwrap());
+            assert_eq!(
+                a.scores.iter().map(|s| s.to_bits()).collect::<Vec<_>>(),
+                b.scores.iter().map(|s| s.to_bits()).collect::<Vec<_>>()
+            );
         }
     }
 }

@@ -8,6 +8,7 @@
 
 mod coarse;
 mod dense;
+mod dense_export;
 mod dense_regions;
 mod link;
 mod matching;
@@ -21,6 +22,7 @@ mod surface;
 mod surface_fit;
 
 pub use dense::{DenseError, DenseRules, Disparity, dense_disparity};
+pub use dense_export::PairDisparityError;
 pub use matching::{MatchFailure, StereoMatch, match_point};
 pub use patch_plane::{
     PlaneFailure, PlaneRules, StereoPlane, SurfacePlane, measure_distant_surface, measure_plane,

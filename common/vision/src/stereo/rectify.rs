@@ -39,14 +39,24 @@ pub struct Rectifier {
     maps: [Vec<[i32; 2]>; 2],
 }
 
-impl Rectifier {
-    /// Plans the rectification. `shift_px` moves the right image's content to the right, which
-    /// lowers all disparities by as much: with the disparity of the farthest point of interest the
-    /// search can start at 0.
-    ///
-    /// # Errors
-    /// [`RectifyError::Geometry`] if the cameras look along their baseline.
-    pub fn new(pair: &StereoPair, shift_px: f64) -> Result<Self, RectifyError> {
+/// What the rectified cameras of a pair have in common, whatever their shift.
+struct Axes {
+    x: Vector3<f64>,
+    y: Vector3<f64>,
+    z: Vector3<f64>,
+    focal_px: f64,
+    baseline_m: f64,
+    /// Where both images' middles look on the average: tangents along x and y.
+    aim: Vector2<f64>,
+}
+
+/// The middle of an image of this size.
+fn middle(size_px: [u32; 2]) -> Vector2<f64> {
+    Vector2::from(size_px.map(|s| 0.5 * (f64::from(s) - 1.0)))
+}
+
+impl Axes {
+    fn of(pair: &StereoPair) -> Result<Self, RectifyError> {
         let centre = |c: &Camera| *c.model.cahv()[0];
         let axis = |c: &Camera| *c.model.cahv()[1];
         let baseline = centre(&pair.right) - centre(&pair.left);
@@ -70,25 +80,53 @@ impl Rectifier {
                 size[0], size[1], other[0], other[1]
             )));
         }
-        let middle = Vector2::new(f64::from(size[0]) - 1.0, f64::from(size[1]) - 1.0) * 0.5;
+        let middle = middle(size);
         // focal length: the scale that both images have in their middles
-        let (mut focal, mut aim) = (0.0, [Vector2::zeros(); 2]);
+        let (mut focal_px, mut aim) = (0.0, [Vector2::zeros(); 2]);
         for (camera, aim) in [&pair.left, &pair.right].into_iter().zip(&mut aim) {
             let (ray, turn) = camera.ray_with_jacobian(&middle)?;
-            focal += 0.5 * 2f64.sqrt() / turn.norm();
+            focal_px += 0.5 * 2f64.sqrt() / turn.norm();
             let d = ray.direction.into_inner();
             if !(d.dot(&z) > 0.2) {
                 return Err(RectifyError::Geometry("the cameras look apart".into()));
             }
             *aim = Vector2::new(d.dot(&x), d.dot(&y)) / d.dot(&z);
         }
-        // the rows' origin is common, the columns' too but for the shift
-        let aim = (aim[0] + aim[1]) * 0.5;
+        Ok(Self {
+            x,
+            y,
+            z,
+            focal_px,
+            baseline_m: baseline.norm(),
+            // the rows' origin is common, the columns' too but for the shift
+            aim: (aim[0] + aim[1]) * 0.5,
+        })
+    }
+}
+
+impl Rectifier {
+    /// Plans the rectification. `shift_px` moves the right image's content to the right, which
+    /// lowers all disparities by as much: with the disparity of the farthest point of interest the
+    /// search can start at 0.
+    ///
+    /// # Errors
+    /// [`RectifyError::Geometry`] if the cameras look along their baseline.
+    pub fn new(pair: &StereoPair, shift_px: f64) -> Result<Self, RectifyError> {
+        let Axes {
+            x,
+            y,
+            z,
+            focal_px: focal,
+            aim,
+            ..
+        } = Axes::of(pair)?;
+        let size = [pair.left.width_px, pair.left.height_px];
+        let middle = middle(size);
         let hc = middle.x - focal * aim.x - 0.5 * shift_px;
         let vc = middle.y - focal * aim.y;
         let virtual_camera = |camera: &Camera, shift: f64| Camera {
             model: CameraModel::Cahv(Cahv {
-                c: centre(camera),
+                c: *camera.model.cahv()[0],
                 a: z,
                 h: x * focal + z * (hc + shift),
                 v: y * focal + z * vc,
@@ -108,6 +146,16 @@ impl Rectifier {
             pair: rectified,
             maps,
         })
+    }
+
+    /// Disparity times depth of the rectified pair (focal length times baseline), px m: a point at
+    /// depth z, m, along the common optical axis has a disparity of this over z, less the shift.
+    ///
+    /// # Errors
+    /// As [`Rectifier::new`].
+    pub fn disparity_depth_px_m(pair: &StereoPair) -> Result<f64, RectifyError> {
+        let axes = Axes::of(pair)?;
+        Ok(axes.focal_px * axes.baseline_m)
     }
 
     /// Rectifies an image; pixels that the taken image does not show are 0.
@@ -143,6 +191,19 @@ impl Rectifier {
             })
             .collect();
         Ok(Image8::from_raw(image.width_px, image.height_px, pixels)?)
+    }
+}
+
+impl Rectifier {
+    /// Whether the taken image of a side shows a rectified pixel.
+    #[must_use]
+    pub fn shows(&self, side: Side, u: i64, v: i64) -> bool {
+        let (map, camera) = match side {
+            Side::Left => (&self.maps[0], &self.pair.left),
+            Side::Right => (&self.maps[1], &self.pair.right),
+        };
+        let (w, h) = (i64::from(camera.width_px), i64::from(camera.height_px));
+        (0..w).contains(&u) && (0..h).contains(&v) && map[(v * w + u) as usize][0] != NOWHERE
     }
 }
 

@@ -43,11 +43,11 @@ pub(super) struct Fidelity {
 }
 
 /// A model that was read, whatever it was written in.
-pub(super) struct Loaded {
+pub(in crate::commands) struct Loaded {
     /// The file's name for messages.
-    pub(super) name: String,
+    pub(in crate::commands) name: String,
     pub(super) format: Format,
-    pub(super) file: ModelFile,
+    pub(in crate::commands) file: ModelFile,
     /// `None` for the formats of the CAHV family itself.
     pub(super) fidelity: Option<Fidelity>,
 }
@@ -104,6 +104,18 @@ pub(super) fn load(path: &Path, rules: &ConversionRules) -> Result<Loaded, Comma
         file,
         fidelity,
     })
+}
+
+/// Reads a model under the usual rules; a conversion that is not exact is reported.
+pub(in crate::commands) fn load_reported(path: &Path) -> Result<Loaded, CommandError> {
+    let loaded = load(path, &ConversionRules::default())?;
+    if let Some(fidelity) = loaded.fidelity.filter(|f| !f.exact) {
+        eprintln!(
+            "{}: its lens was fitted, {:.2e} px off at worst",
+            loaded.name, fidelity.worst_px
+        );
+    }
+    Ok(loaded)
 }
 
 fn converted(

@@ -1,12 +1,12 @@
 //! `rover camera project | ray | triangulate`: tables of points and pixels.
 
-use super::files::{Loaded, load};
+use super::files::load_reported;
 use crate::{
     commands::CommandError,
     tables::{Table, TableWriter},
 };
 use nalgebra::{Vector2, Vector3};
-use rover_cameras::{Camera, CameraError, closest_point, formats::ConversionRules};
+use rover_cameras::{Camera, CameraError, closest_point};
 use std::path::PathBuf;
 
 /// Where a table goes.
@@ -58,18 +58,6 @@ pub(super) struct TriangulateArgs {
     out: OutArgs,
 }
 
-/// A model whose conversion, if any, is reported.
-fn model(path: &std::path::Path) -> Result<Loaded, CommandError> {
-    let loaded = load(path, &ConversionRules::default())?;
-    if let Some(fidelity) = loaded.fidelity.filter(|f| !f.exact) {
-        eprintln!(
-            "{}: its lens was fitted, {:.2e} px off at worst",
-            loaded.name, fidelity.worst_px
-        );
-    }
-    Ok(loaded)
-}
-
 /// Answers every row of a table.
 fn answer_all<const N: usize, const M: usize>(
     input: &std::path::Path,
@@ -95,7 +83,7 @@ fn answer_all<const N: usize, const M: usize>(
 
 /// `rover camera project`.
 pub(super) fn project(args: &ProjectArgs) -> Result<(), CommandError> {
-    let loaded = model(&args.model)?;
+    let loaded = load_reported(&args.model)?;
     let camera = loaded.camera().ok();
     let project = |[x, y, z]: [f64; 3]| -> Result<[f64; 3], CameraError> {
         let image = loaded
@@ -130,7 +118,7 @@ pub(super) fn project(args: &ProjectArgs) -> Result<(), CommandError> {
 
 /// `rover camera ray`.
 pub(super) fn ray(args: &RayArgs) -> Result<(), CommandError> {
-    let loaded = model(&args.model)?;
+    let loaded = load_reported(&args.model)?;
     answer_all(
         &args.pixels,
         &args.out,
@@ -151,7 +139,7 @@ pub(super) fn ray(args: &RayArgs) -> Result<(), CommandError> {
 
 /// `rover camera triangulate`.
 pub(super) fn triangulate(args: &TriangulateArgs) -> Result<(), CommandError> {
-    let (left, right) = (model(&args.left)?, model(&args.right)?);
+    let (left, right) = (load_reported(&args.left)?, load_reported(&args.right)?);
     if let (Some(l), Some(r)) = (&left.file.frame, &right.file.frame)
         && l != r
     {

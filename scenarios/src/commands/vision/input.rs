@@ -4,12 +4,13 @@ use std::io::Read;
 use std::path::Path;
 
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
-use rover_cameras::{Camera, StereoPair, formats};
+use rover_cameras::{Camera, StereoPair};
 use rover_vision::Image8;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::commands::CommandError;
+use crate::commands::camera::files::load_reported;
 use crate::output::Output;
 
 /// Reads all of a file; `-` is standard input.
@@ -45,18 +46,14 @@ pub fn toml_file<T: DeserializeOwned>(path: &Path) -> Result<T, CommandError> {
         .map_err(|e| CommandError::BadInput(format!("{}: {e}", path.display())))
 }
 
-/// Reads a camera model. A file without an image size takes that of `image`; another size than the
-/// image's is refused.
+/// Reads a camera model of any format that `rover camera` reads. A file without an image size takes
+/// that of `image`; another size than the image's is refused.
 pub fn camera(path: &Path, image: &Image8) -> Result<Camera, CommandError> {
+    let loaded = load_reported(path)?;
     let refuse =
-        |e: &dyn std::fmt::Display| CommandError::BadInput(format!("{}: {e}", path.display()));
-    let file: formats::ModelFile = if path.extension().is_some_and(|e| e == "toml") {
-        toml_file(path)?
-    } else {
-        formats::read_text(&text(path)?).map_err(|e| refuse(&e))?
-    };
+        |e: &dyn std::fmt::Display| CommandError::BadInput(format!("{}: {e}", loaded.name));
     let size = [image.width_px, image.height_px];
-    if let Some(stated) = file.size_px
+    if let Some(stated) = loaded.file.size_px
         && stated != size
     {
         return Err(refuse(&format!(
@@ -65,7 +62,7 @@ pub fn camera(path: &Path, image: &Image8) -> Result<Camera, CommandError> {
         )));
     }
     let camera = Camera {
-        model: file.model,
+        model: loaded.file.model,
         width_px: size[0],
         height_px: size[1],
     };

@@ -45,9 +45,15 @@ struct Loaded {
 }
 
 impl PairArgs {
-    fn load(&self) -> Result<Loaded, CommandError> {
+    /// The cameras, the left and the right image.
+    pub fn images(&self) -> Result<(StereoPair, Image8, Image8), CommandError> {
         let (left, right) = (input::image(&self.left)?, input::image(&self.right)?);
         let pair = input::pair((&self.left_model, &self.right_model), (&left, &right))?;
+        Ok((pair, left, right))
+    }
+
+    fn load(&self) -> Result<Loaded, CommandError> {
+        let (pair, left, right) = self.images()?;
         let prepare = |image: &Image8| {
             PreparedImage::new(image).map_err(|e| CommandError::BadInput(e.to_string()))
         };

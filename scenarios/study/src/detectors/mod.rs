@@ -1,6 +1,7 @@
 //! Bias, sigma, detection and false-accept rates of every detector and of the matcher, over patches
 //! with known truth.
 
+mod bound;
 mod patch;
 mod trials;
 
@@ -29,6 +30,10 @@ pub struct Row {
     /// The error's length that 95 % stay below, px.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub p95_px: Option<f64>,
+    /// What the noise allows in the window that is matched (Cramer-Rao), root mean square over the
+    /// patches, px; for subjects that may come up against it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub bound_px: Option<f64>,
     /// Errors per stated standard deviation, rms (1 is honest).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stated: Option<f64>,
@@ -44,18 +49,13 @@ pub struct Row {
     pub target: &'static str,
 }
 
-/// Grey noise that is evaluated, DN of 255.
+/// Grey noise that is evaluated unless another is asked for, DN of 255.
 pub const NOISES_DN: [f64; 2] = [1.0, 5.0];
 /// Accepted results farther off are counted by themselves and not in bias and sigma, px.
 const GROSS_PX: f64 = 1.0;
 
-/// Trials of one subject at one noise: half of `patches`, rounded up for the first noise.
-pub fn evaluate(subject: &Subject, noise_dn: f64, patches: u32, k: usize, stream: u64) -> Row {
-    let share = if k == 0 {
-        patches.div_ceil(2)
-    } else {
-        patches / 2
-    };
+/// `share` trials of one subject at one noise.
+pub fn evaluate(subject: &Subject, noise_dn: f64, share: u32, stream: u64) -> Row {
     let outcomes: Vec<Outcome> = (0..share)
         .into_par_iter()
         .map(|i| (subject.trial)(&mut patch::rng(stream, u64::from(i)), noise_dn))
@@ -75,6 +75,8 @@ pub fn evaluate(subject: &Subject, noise_dn: f64, patches: u32, k: usize, stream
         .filter_map(|o| o.error_px.map(|[u, v]| (u, v, o.sigma_px)))
         .collect();
     let n = good.len() as f64;
+    let bounds: Vec<f64> = outcomes.iter().filter_map(|o| o.bound_px).collect();
+    let bound_square = bounds.iter().map(|b| b * b).sum::<f64>() / bounds.len() as f64;
     let mut row = Row {
         name: subject.name,
         noise_dn,
@@ -83,6 +85,7 @@ pub fn evaluate(subject: &Subject, noise_dn: f64, patches: u32, k: usize, stream
         bias_px: None,
         sigma_px: None,
         p95_px: None,
+        bound_px: bound_square.is_finite().then(|| bound_square.sqrt()),
         stated: None,
         gross: gross as u32,
         gross_px: GROSS_PX,

@@ -78,6 +78,13 @@ impl Light {
     }
 }
 
+impl Light {
+    /// Grey values per grey value of the scene, in the middle of the patch.
+    pub fn gain(&self) -> f64 {
+        self.gain
+    }
+}
+
 /// A standard normal number (Box and Muller).
 pub fn normal(rng: &mut ChaCha8Rng) -> f64 {
     let (a, b): (f64, f64) = (rng.random(), rng.random());

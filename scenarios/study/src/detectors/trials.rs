@@ -17,6 +17,7 @@ use rover_vision::harris::HarrisRules;
 use rover_vision::ncc::Window;
 use rover_vision::texture::texture;
 
+use super::bound::{Unknown, bound_px};
 use super::patch::{self, EDGES, FOCAL_PX, Light};
 
 /// How a trial ended. Without an error nothing was accepted.
@@ -25,12 +26,15 @@ pub struct Outcome {
     pub error_px: Option<[f64; 2]>,
     /// Standard deviation that the detector states, px.
     pub sigma_px: f64,
+    /// What the noise allows in this patch, px, where it was worked out.
+    pub bound_px: Option<f64>,
 }
 
 impl Outcome {
     const MISSED: Self = Self {
         error_px: None,
         sigma_px: 0.0,
+        bound_px: None,
     };
 
     /// Length of the error, px; 0 without one.
@@ -42,7 +46,13 @@ impl Outcome {
         Self {
             error_px: Some([found.u_px - truth.x, found.v_px - truth.y]),
             sigma_px: found.sigma_px,
+            bound_px: None,
         }
+    }
+
+    fn bounded_by(mut self, bound_px: Option<f64>) -> Self {
+        self.bound_px = bound_px;
+        self
     }
 }
 
@@ -213,6 +223,8 @@ fn harris(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
 
 /// Rim that is rendered around a picture and cut off, px.
 const RIM_PX: u32 = 6;
+/// Side of the picture that is cut out, px.
+const CUT_PX: u32 = 31;
 
 /// A picture of rock, 31 px wide, seen straight on at another subpixel place, light and noise.
 fn template(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
@@ -231,22 +243,30 @@ fn template(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
             })
             .collect();
         let light = Light::random(rng);
+        let clean = patch::expose(&picture, wide, &light, 0.0, &mut rng.clone())?;
         let seen = patch::expose(&picture, wide, &light, noise_dn, rng)?;
         let inner = (0..side * side).map(|i| seen.get(RIM_PX + i % side, RIM_PX + i / side));
-        Image8::from_raw(side, side, inner.collect::<Option<Vec<u8>>>()?).ok()
+        let image = Image8::from_raw(side, side, inner.collect::<Option<Vec<u8>>>()?).ok()?;
+        Some((image, clean, light.gain()))
     };
     let whole = take(Vector2::zeros(), SIDE_PX);
     let truth =
         Vector2::new(47.3, 46.8) + Vector2::new((seed % 97) as f64, (seed % 89) as f64) * 0.1;
-    let picture = take(truth - Vector2::repeat(15.0), 31);
-    let (Some(image), Some(picture)) = (whole, picture) else {
+    let picture = take(truth - Vector2::repeat(15.0), CUT_PX);
+    let (Some((image, _, gain)), Some((picture, clean, picture_gain))) = (whole, picture) else {
         return Outcome::MISSED;
     };
+    // both are noisy; the image's noise in grey values of the picture
+    let noise = noise_dn * (picture_gain / gain).hypot(1.0);
+    let middle = i64::from(RIM_PX + CUT_PX / 2);
+    // the outermost pixels have no slopes
+    let half = i64::from(CUT_PX / 2) - 1;
     let rules = TemplateRules::default();
     first(
         find::template(&image, &picture, Window::whole(&image), &rules),
         &truth,
     )
+    .bounded_by(bound_px(&clean, [middle; 2], half, noise, Unknown::Affine))
 }
 
 /// The picture that is looked for in patches without it.

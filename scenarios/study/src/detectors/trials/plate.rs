@@ -58,6 +58,7 @@ fn trial(
         Some(Outcome {
             error_px: Some([off.x, off.y]),
             sigma_px: point.sigma_px,
+            bound_px: None,
         })
     };
     attempt(rng).unwrap_or(Outcome::MISSED)

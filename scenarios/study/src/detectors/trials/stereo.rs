@@ -10,6 +10,7 @@ use rover_vision::{
     match_point, measure_surface,
 };
 
+use super::super::bound::{Unknown, bound_px};
 use super::super::patch::{self, FOCAL_PX, Light};
 use super::{MAX_TILT_RAD, Outcome};
 
@@ -25,6 +26,8 @@ struct PlanePair {
     pixel: Vector2<f64>,
     pose: Isometry3<f64>,
     shift_px: f64,
+    /// The left image without noise.
+    clean: Image8,
 }
 
 fn plane_pair(rng: &mut ChaCha8Rng, noise_dn: f64, size: (u32, u32)) -> Option<PlanePair> {
@@ -38,11 +41,11 @@ fn plane_pair(rng: &mut ChaCha8Rng, noise_dn: f64, size: (u32, u32)) -> Option<P
     let seed: u64 = rng.random::<u64>() >> 1;
     let shade = move |x: f64, y: f64| Some(texture(x, y, 0.064, 0.0015, 18.0, seed));
     let light = Light::random(rng);
-    let mut take = |camera: &Camera| {
-        let picture = patch::draw(camera, &pose, &shade, &|_, _| 110.0, patch::SMOOTH);
-        patch::expose(&picture, size.0, &light, noise_dn, rng)
-    };
-    let (left, right) = (take(&pair.left)?, take(&pair.right)?);
+    let draw = |camera: &Camera| patch::draw(camera, &pose, &shade, &|_, _| 110.0, patch::SMOOTH);
+    let pictures = [draw(&pair.left), draw(&pair.right)];
+    let clean = patch::expose(&pictures[0], size.0, &light, 0.0, &mut rng.clone())?;
+    let left = patch::expose(&pictures[0], size.0, &light, noise_dn, rng)?;
+    let right = patch::expose(&pictures[1], size.0, &light, noise_dn, rng)?;
     let pixel = patch::seen(&pair.left, &pose, 0.0, 0.0)?.map(f64::round);
     Some(PlanePair {
         pair,
@@ -51,6 +54,7 @@ fn plane_pair(rng: &mut ChaCha8Rng, noise_dn: f64, size: (u32, u32)) -> Option<P
         pixel,
         pose,
         shift_px,
+        clean,
     })
 }
 
@@ -87,17 +91,26 @@ fn match_rules() -> MatchRules {
 }
 
 pub(super) fn stereo_match(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
+    let Some(p) = plane_pair(rng, noise_dn, PAIR_PX) else {
+        return Outcome::MISSED;
+    };
+    let rules = match_rules();
     let attempt = || {
-        let p = plane_pair(rng, noise_dn, PAIR_PX)?;
         let (left, right) = p.prepared()?;
         let truth = p.right_px(&p.pixel)?;
-        let found = match_point(&left, &right, &p.pair, &p.pixel, &match_rules()).ok()?;
+        let found = match_point(&left, &right, &p.pair, &p.pixel, &rules).ok()?;
         Some(Outcome {
             error_px: Some([found.right_px.x - truth.x, 0.0]),
             sigma_px: found.sigma_px,
+            bound_px: None,
         })
     };
-    attempt_or_missed(attempt)
+    // both images are as noisy
+    let noise = noise_dn * std::f64::consts::SQRT_2;
+    let centre = [p.pixel.x as i64, p.pixel.y as i64];
+    let half = i64::from(rules.half_window_px);
+    let bound = bound_px(&p.clean, centre, half, noise, Unknown::Disparity);
+    attempt_or_missed(attempt).bounded_by(bound)
 }
 
 pub(super) fn surface(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
@@ -114,6 +127,7 @@ pub(super) fn surface(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
         Some(Outcome {
             error_px: Some([at.x - truth.x, 0.0]),
             sigma_px: found.sigma_px,
+            bound_px: None,
         })
     };
     attempt_or_missed(attempt)
@@ -139,6 +153,7 @@ pub(super) fn dense(rng: &mut ChaCha8Rng, noise_dn: f64) -> Outcome {
         Some(Outcome {
             error_px: Some([(pixel.x - truth.x) - found, 0.0]),
             sigma_px: f64::NAN,
+            bound_px: None,
         })
     };
     attempt_or_missed(attempt)
