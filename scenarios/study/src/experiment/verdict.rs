@@ -23,12 +23,10 @@ impl Experiment {
         let (exact_low, exact_high) = range(&|r| r.exact_slope_mm_per_m);
         let (r2, _) = range(&|r| r.r2);
         let (near, far) = range(&|r| r.error_at_16cm_mm);
-        let (tip_low, tip_high) = range(&|r| r.tip_intercept_mm);
-        let (plate_low, plate_high) = range(&|r| r.plate_intercept_mm);
         let (_, field) = range(&|r| r.field_slope_mm_per_m / r.tip_slope_mm_per_m);
-        let plate = |name| {
+        let of = |name, what: fn(&AtReference) -> f64| {
             let setting = self.at_reference.iter().find(|a| a.setting == name);
-            setting.map_or(f64::NAN, |a| a.plate_mm)
+            setting.map_or(f64::NAN, what)
         };
         let steeper = self
             .references
@@ -41,24 +39,25 @@ impl Experiment {
              by {low:.0} to {high:.0} mm per metre (the line explains at least {:.0} % of the \
              variance), where the numeric study predicts {theory_low:.0} to {theory_high:.0}; \
              it is steeper than predicted at {steeper} of {} places. With sight that has no error \
-             it would grow by {exact_low:.0} to {exact_high:.0}: the rest comes from the wrong \
+             it would grow by {exact_low:.0} to {exact_high:.0} (other targets and other robots \
+             than the numeric study's); the rest comes from the wrong \
              intrinsics, whose error in range differs from place to place, as the paper \
              supposes. At 16 cm it is \
              {near:.1} to {far:.1} mm. Correction was worse than none at {worse} of {} targets. \
              {} That is the fiducial's mark, brought to the target itself. For the instrument's tip \
-             the line begins at {tip_low:.1} to {tip_high:.1} mm with the same vector, because the \
-             direction of the tool is not corrected, and at {plate_low:.1} to {plate_high:.1} mm \
-             with the pose of the plate, whose range comes from the plate's size, too, so that the \
-             cameras' errors are not the same for target and fiducial: at the first place it leaves \
-             {:.1} mm, with exact intrinsics {:.1} mm. The tip's error with the \
+             the mark's vector leaves {:.1} mm at that place, because the direction of the tool is \
+             not corrected; the pose of the plate leaves {:.1} mm, with exact intrinsics {:.1} mm: \
+             its range comes from the plate's size, too, so that the cameras' errors are not the \
+             same for target and fiducial. The tip's error with the \
              field made from six looks on a straight 12 cm grows at most {field:.2} times as fast \
              as with one vector.",
             r2 * 100.0,
             self.references.len(),
             points().count(),
             self.at_the_place(),
-            plate(EVERYTHING),
-            plate(EXACT_LENSES),
+            of(EVERYTHING, |a| a.tip_mm),
+            of(EVERYTHING, |a| a.plate_mm),
+            of(EXACT_LENSES, |a| a.plate_mm),
         )
     }
 
