@@ -309,8 +309,8 @@ pub fn harris(
 }
 
 /// Standard deviation stated for Harris corners, px: that of a corner's place between two exposures
-/// of one textured surface with grey noise of 3 DN. `rover vision evaluate --only harris` measures
-/// 0.08 px at 1 DN and 0.26 px at 5 DN. How far a corner lies from the surface mark that a person
+/// of one textured surface with grey noise of 3 DN, for which `rover vision evaluate --only harris
+/// --noise 3 --patches 600 --seed 2` measures 0.18 px. How far a corner lies from the surface mark that a person
 /// would call the corner is another matter: the response pulls it inwards.
 pub const HARRIS_SIGMA_PX: f64 = 0.2;
 
