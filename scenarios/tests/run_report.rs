@@ -71,8 +71,19 @@ fn the_json_has_exactly_the_fields_of_the_interface() {
     assert_eq!(
         keys(&value),
         [
-            "approach", "contact", "digest", "outcome", "phases", "reason", "robot", "scenario",
-            "seed", "servo", "target", "truth"
+            "approach",
+            "contact",
+            "digest",
+            "outcome",
+            "phases",
+            "reason",
+            "robot",
+            "scenario",
+            "seed",
+            "servo",
+            "target",
+            "truth",
+            "wall_by_kind_s"
         ]
     );
     assert_eq!(

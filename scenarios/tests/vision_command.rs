@@ -283,7 +283,6 @@ fn the_disparity_image_has_the_planes_depth_and_marks_what_it_does_not_know() {
         lines.next(),
         Some("u_px,v_px,disparity_px,x_m,y_m,z_m,status")
     );
-    let aside = 159.5 - summary["rectified_left"]["h"][2].as_f64().unwrap();
     let (mut found, mut all, mut off) = (0u64, 0, Vec::new());
     let mut disparities = Vec::new();
     for line in lines {

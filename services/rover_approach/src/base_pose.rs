@@ -27,8 +27,10 @@ pub struct BaseRules {
     pub heading_rad: [f64; 2],
     /// Distances of the tip from the target at which the fiducial is looked at, m.
     pub stations_m: [f64; 2],
-    /// Distance of target and fiducial from the images' border, px.
+    /// Distance of the target from the images' border, px.
     pub border_px: f64,
+    /// Distance of the fiducial's plate from the images' border, px.
+    pub plate_border_px: f64,
     /// Largest angle between the fiducial's normal and the direction to a camera, rad.
     pub max_facing_rad: f64,
     /// Least ratio of the tip's smallest to its largest free motion.
@@ -57,6 +59,7 @@ impl Default for BaseRules {
             heading_rad: [1.0, 0.125],
             stations_m: [0.12, 0.03],
             border_px: 30.0,
+            plate_border_px: 40.0,
             max_facing_rad: 1.0,
             min_manipulability: 0.05,
             min_limit_rad: 0.05,
@@ -75,6 +78,7 @@ impl BaseRules {
     #[must_use]
     pub fn at_the_limit() -> Self {
         Self {
+            plate_border_px: 8.0,
             max_facing_rad: 1.13,
             ..Self::default()
         }
@@ -476,7 +480,7 @@ impl BaseTask<'_> {
             for (x, y) in [(-w, -h), (w, -h), (-w, h), (w, h)] {
                 let corner = (plate * Point3::new(x, y, 0.0)).coords;
                 let pixel = camera.project(&corner).ok()?;
-                if !camera.contains(&pixel, 8.0) {
+                if !camera.contains(&pixel, self.rules.plate_border_px) {
                     return None;
                 }
                 worst = worst.max(normal.angle(&(camera.model.cahv()[0] - corner)));

@@ -102,49 +102,56 @@ mod tests {
 
     const ROCKY: &str = include_str!("../../../scenarios/robots/rocky8.toml");
 
-    /// The Rocky 8 under a sun straight above.
-    fn shadow() -> OwnShadow {
+    /// The Rocky 8 under a sun straight above, and the place on the ground below its body.
+    fn shadow() -> (OwnShadow, Vector3<f64>) {
         let robot = Robot::parse(ROCKY, "rocky8").unwrap();
-        let stowed = vec![0.0; robot.arm.joint_count()];
-        OwnShadow::new(Arc::new(Shade::of(&robot, &stowed)), Vector3::z())
+        let stowed = robot.posture("stow").unwrap();
+        let body = &robot.description().body[0];
+        let middle = (Vector3::from(body.from_m) + Vector3::from(body.to_m)) / 2.0;
+        let shade = Arc::new(Shade::of(&robot, stowed));
+        let below = Vector3::new(middle.x, middle.y, 0.0);
+        (OwnShadow::new(shade, Vector3::z()), below)
     }
 
-    /// A row of points on the ground along y at x = 0.
-    fn row(n: usize, to_m: f64) -> Vec<Vector3<f64>> {
+    /// A row of points on the ground from `from` along y.
+    fn row(from: &Vector3<f64>, n: usize, to_m: f64) -> Vec<Vector3<f64>> {
         (0..n)
-            .map(|i| Vector3::new(0.0, to_m * i as f64 / n as f64, 0.0))
+            .map(|i| from + Vector3::y() * (to_m * i as f64 / n as f64))
             .collect()
     }
 
     #[test]
-    fn with_the_sun_overhead_the_ground_below_the_rover_is_dark_and_beside_it_lit() {
-        let shadow = shadow();
-        assert_eq!(shadow.light(&Vector3::zeros()), Light::Shadow);
+    fn with_the_sun_overhead_the_ground_below_the_body_is_dark_and_beside_it_lit() {
+        let (shadow, below) = shadow();
+        assert_eq!(shadow.light(&below), Light::Shadow);
         assert_eq!(shadow.light(&Vector3::new(0.0, 3.0, 0.0)), Light::Sun);
-        let lights: Vec<Light> = row(300, 3.0).iter().map(|p| shadow.light(p)).collect();
+        let lights: Vec<Light> = row(&below, 300, 3.0)
+            .iter()
+            .map(|p| shadow.light(p))
+            .collect();
         assert!(lights.contains(&Light::Edge));
     }
 
     #[test]
     fn pixels_across_the_edge_are_left_out_and_a_template_mostly_on_it_is_refused() {
-        let shadow = shadow();
+        let (shadow, below) = shadow();
         let still = |points: Vec<Vector3<f64>>| {
             let weights = vec![1.0 / points.len() as f64; points.len()];
             let places = points.into_iter().map(|p| Some([p, p]));
             lit_alike([Some(&shadow), Some(&shadow)], places, &weights)
         };
-        let edge_m = row(3000, 3.0)
-            .iter()
-            .find(|p| shadow.light(p) != Light::Shadow)
-            .unwrap()
-            .y;
-        // a fifth of the row is within the shadow, the rest far beyond
-        let mostly_lit = row(500, 5.0 * edge_m);
+        // from the outside inwards, the first place that is not lit
+        let edge = row(&below, 3000, 3.0)
+            .into_iter()
+            .rev()
+            .find(|p| shadow.light(p) != Light::Sun)
+            .unwrap();
+        let mostly_lit = row(&below, 500, 5.0 * (edge.y - below.y));
         let kept = still(mostly_lit.clone()).unwrap().unwrap();
         for (point, kept) in mostly_lit.iter().zip(kept) {
             assert_eq!(kept, shadow.light(point) == Light::Sun, "{point}");
         }
-        let on_it = vec![Vector3::new(0.0, edge_m + 0.5 * EDGE_M, 0.0); 9];
+        let on_it = vec![edge; 9];
         assert!(matches!(still(on_it), Err(TrackError::OwnShadow { .. })));
         let beyond = vec![Vector3::new(0.0, 9.0, 0.0); 9];
         assert_eq!(still(beyond).unwrap(), None);
@@ -152,8 +159,8 @@ mod tests {
 
     #[test]
     fn what_was_lit_and_now_is_dark_is_compared_with_its_like() {
-        let shadow = shadow();
-        let (lit, dark) = (Vector3::new(0.0, 9.0, 0.0), Vector3::zeros());
+        let (shadow, dark) = shadow();
+        let lit = Vector3::new(0.0, 9.0, 0.0);
         let places = [[lit, dark], [lit, dark], [lit, dark], [lit, lit]];
         let kept = lit_alike(
             [Some(&shadow), Some(&shadow)],

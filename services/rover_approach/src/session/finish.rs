@@ -1,7 +1,7 @@
 //! The end of the approach: first ray, hand-over, and the target as the body pair sees it.
 
 use super::Session;
-use crate::base_pose::{BaseChoice, Serving, TargetSpot};
+use crate::base_pose::{BaseChoice, BaseRules, Serving, TargetSpot};
 use crate::first_ray::{FirstRayRules, first_ray};
 use crate::handover::{HandoverRules, hand_over};
 use crate::hardware::fault;
@@ -66,7 +66,7 @@ impl Session<'_> {
             position_m: target.position_m.coords,
             normal: target.normal.unit.into_inner(),
         };
-        if let Err(reason) = self.served_from_here(&spot)? {
+        if let Err(reason) = self.served_from_here(&spot, &BaseRules::at_the_limit())? {
             return self.otherwise(&target, &reason);
         }
         let lateral = self.budget.lateral_m();

@@ -47,7 +47,13 @@ impl Session<'_> {
         };
         let rules = BaseRules::at_the_limit();
         let task = self.task(&rules)?;
-        let here = self.served_from_here(&spot)?;
+        // Where the body cameras have refused a pose already, one is not enough that just serves.
+        let required = if self.second_choices_n > 0 {
+            BaseRules::default()
+        } else {
+            BaseRules::at_the_limit()
+        };
+        let here = self.served_from_here(&spot, &required)?;
         let best_arm = choice.serving.iter().map(|s| s.arm_score);
         let best_arm = best_arm.fold(f64::NEG_INFINITY, f64::max);
         if let (Ok(serving), Some(best)) = (&here, choice.serving.first()) {
@@ -176,10 +182,10 @@ impl Session<'_> {
     pub(super) fn served_from_here(
         &self,
         spot: &TargetSpot,
+        rules: &BaseRules,
     ) -> Result<Result<Serving, String>, Fault> {
         let level = self.level_from_rover();
-        let rules = BaseRules::at_the_limit();
-        let task = self.task(&rules)?;
+        let task = self.task(rules)?;
         let here = PlanarPose {
             x_m: 0.0,
             y_m: 0.0,
