@@ -173,7 +173,7 @@ impl<'a> Mission<'a> {
     /// To the standoff and on to contact.
     async fn place_from_here(&mut self, record: &mut Record, target: &Target) -> Result<(), Fault> {
         let (peer, question_limit) = (self.peer, self.scenario.limits.question());
-        let placed = self.to_standoff(target).await?;
+        let placed = self.reach_standoff(target).await?;
         if let Some(evidence) = &mut self.evidence {
             evidence.looks.clone_from(&placed.looks);
             evidence
@@ -189,7 +189,7 @@ impl<'a> Mission<'a> {
     }
 
     /// Surveys the ground before the arm and brings the instrument to the standoff.
-    async fn to_standoff(&mut self, target: &Target) -> Result<PlaceResult, Fault> {
+    async fn reach_standoff(&mut self, target: &Target) -> Result<PlaceResult, Fault> {
         let (peer, scenario) = (self.peer, self.scenario);
         let question_limit = scenario.limits.question();
         let started = self.begin("survey");

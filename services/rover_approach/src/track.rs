@@ -389,14 +389,13 @@ impl Tracker {
         let turned = self.view_change_rad(view, index) >= self.rules.anchor_turn_rad;
         let mut relief_px = Vector2::zeros();
         let mut anchored = false;
-        if shrunk || turned || last_stop {
-            if let Some(moved) = self.relieved(view, index) {
-                relief_px = moved.0 - self.pixel_px;
-                (self.pixel_px, self.surface) = moved;
-            }
+        let renewed = shrunk || turned || last_stop;
+        if renewed && let Some(moved) = self.relieved(view, index) {
+            relief_px = moved.0 - self.pixel_px;
+            (self.pixel_px, self.surface) = moved;
         }
         if let Ok(new) = anchor(Arc::clone(view), self.pixel_px, &self.surface, &self.rules) {
-            if shrunk || turned || last_stop {
+            if renewed {
                 anchored = true;
                 self.push(new);
             } else {
