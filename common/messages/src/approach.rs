@@ -139,6 +139,21 @@ pub struct ApproachStop {
     pub sigma_mm: [f64; 3],
     /// Slip estimated on the way to this stop.
     pub slip: f64,
+    /// What the pictures told of the motion to this stop; none where odometry alone did.
+    #[serde(default)]
+    pub seen_motion: Option<SeenMotion>,
+}
+
+/// A motion between two stops that landmarks in the pictures agree on.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SeenMotion {
+    /// Landmarks that agree.
+    pub agreeing_n: u32,
+    /// Landmarks found.
+    pub found_n: u32,
+    /// Root mean square distance of the agreeing ones from where the motion puts them, px.
+    pub rms_px: f64,
 }
 
 /// What one source adds to the error of the position.
@@ -233,7 +248,7 @@ impl Wire for DriveToGoal {
 }
 
 impl Wire for DriveToResult {
-    const SCHEMA: &'static str = "drive_to_result/3";
+    const SCHEMA: &'static str = "drive_to_result/4";
     fn validate(&self) -> Result<(), String> {
         self.target.validate().map_err(|e| format!("target.{e}"))?;
         finite("tracked_px", &self.tracked_px)?;

@@ -68,6 +68,9 @@ pub struct StopReport {
     pub sigma_mm: [f64; 3],
     /// Slip estimated on the way to this stop.
     pub slip: f64,
+    /// What the pictures told of the motion to this stop; `null` where odometry alone did.
+    #[serde(default)]
+    pub seen_motion: Option<rover_messages::approach::SeenMotion>,
 }
 
 /// The true lateral error of the placement by source, in the plane of the true normal at the
@@ -144,6 +147,7 @@ impl ApproachReport {
                 looks_n: s.sightings.len() as u32,
                 sigma_mm: s.sigma_mm,
                 slip: s.slip,
+                seen_motion: s.seen_motion.clone(),
             }
         };
         let share = |s: &rover_messages::approach::ErrorShare| (s.source.clone(), s.sigma_mm);

@@ -218,28 +218,31 @@ impl Placement {
                 compensation: self.estimator.compensation(),
             }));
         }
-        self.check_convergence(correction)?;
+        self.check_convergence(correction, predicted_error_m)?;
         self.corrections.push(correction);
         self.phase = Phase::Arrived;
         Ok(Step::Move(self.request(PlanGoal::Straight(vec![pose]))))
     }
 
-    fn check_convergence(&self, correction: f64) -> Result<(), Fault> {
+    /// Corrections that do not shrink mean that the fiducial is not where the model's errors put
+    /// it, unless they are no larger than the error that is predicted anyway: then they are noise.
+    fn check_convergence(&self, correction: f64, predicted_error_m: f64) -> Result<(), Fault> {
         let [.., before, last] = self.corrections[..] else {
             return Ok(());
         };
         let growing = last > CONVERGENCE_RATIO * before && correction > CONVERGENCE_RATIO * last;
-        if !growing {
+        if !growing || correction <= predicted_error_m {
             return Ok(());
         }
         Err(fault(
             "not_converging",
             format!(
                 "corrections at the standoff do not shrink: {:.2}, {:.2}, {:.2} mm, expected each \
-                 below {CONVERGENCE_RATIO} of the one before",
+                 below {CONVERGENCE_RATIO} of the one before or within the predicted {:.2} mm",
                 before * 1e3,
                 last * 1e3,
-                correction * 1e3
+                correction * 1e3,
+                predicted_error_m * 1e3
             ),
         )
         .with("correction_mm", correction * 1e3))

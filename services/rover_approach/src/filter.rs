@@ -51,6 +51,27 @@ impl Motion {
             covariance,
         }
     }
+
+    /// The motion as a camera at `eye_m` (rover frame) shows it whose mount and mast are built into
+    /// the rover with an error of `mount_rad` about each axis, and that is pointed with an error of
+    /// `pointing_rad` at either stop, one sigma: the way then leads off aside, and a turn swings the
+    /// camera about another place and axis.
+    #[must_use]
+    pub fn seen_from(&self, eye_m: &Vector3<f64>, mount_rad: f64, pointing_rad: f64) -> Self {
+        let way_m = self.now_from_last.translation.vector.norm();
+        let turn_rad = self.now_from_last.rotation.angle();
+        let aside = (mount_rad * way_m).powi(2) + (mount_rad * turn_rad * eye_m.norm()).powi(2);
+        let turned = (mount_rad * turn_rad).powi(2) + 2.0 * pointing_rad * pointing_rad;
+        let mut covariance = self.covariance;
+        for k in 0..3 {
+            covariance[(k, k)] += aside;
+            covariance[(k + 3, k + 3)] += turned;
+        }
+        Self {
+            now_from_last: self.now_from_last,
+            covariance,
+        }
+    }
 }
 
 /// How good odometry and attitude sensor are, one sigma.

@@ -14,6 +14,7 @@ pub mod align;
 pub mod anchor;
 pub mod base_pose;
 pub mod drive;
+pub mod egomotion;
 pub mod error;
 pub mod filter;
 pub mod first_ray;

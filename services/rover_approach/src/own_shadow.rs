@@ -38,6 +38,12 @@ impl OwnShadow {
         Self { shade, sun }
     }
 
+    /// Whether a point (rover frame, m) lies on the shadow's edge, as well as that is known.
+    #[must_use]
+    pub fn has_edge_at(&self, point_m: &Vector3<f64>) -> bool {
+        self.light(point_m) == Light::Edge
+    }
+
     fn light(&self, point_m: &Vector3<f64>) -> Light {
         if self.shade.covers(point_m, &self.sun, -EDGE_M) {
             Light::Shadow

@@ -56,12 +56,6 @@ pub struct Patch {
 const MAX_SAMPLES: usize = 10;
 
 impl Patch {
-    /// The grey values about `pixel_px` of an image; `None` if the window leaves it.
-    #[must_use]
-    pub fn cut(image: &PreparedImage, pixel_px: &Vector2<f64>, half: HalfSize) -> Option<Self> {
-        Self::by_map(image, half, &Matrix2::identity(), |d| Some(pixel_px + d))
-    }
-
     /// The grey values of `image` that `warp` assigns to the template's pixels, each the mean over
     /// the pixel's footprint; `None` if one leaves the image.
     #[must_use]

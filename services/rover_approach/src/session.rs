@@ -6,6 +6,7 @@ mod near;
 
 use crate::anchor::TrackRules;
 use crate::drive::{DriveRules, next_movement};
+use crate::egomotion::{Egomotion, EgomotionRules, Landmark, egomotion};
 use crate::filter::{Motion, TargetEstimate};
 use crate::fix::{Fix, Refusal};
 use crate::hardware::{Frame, Hardware, Light, fault};
@@ -14,6 +15,7 @@ use crate::report::{Budget, sighting, sigma_mm};
 use crate::service::unfit;
 use crate::shade::Shade;
 use crate::track::Tracker;
+use crate::view::View;
 use finish::Finish;
 use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector2, Vector3};
 use near::NearStep;
@@ -21,7 +23,8 @@ use rover_geometry::Point;
 use rover_messages::{
     Fault,
     approach::{
-        ApproachActivity, ApproachStop, DriveToFeedback, DriveToGoal, DriveToResult, Sighting,
+        ApproachActivity, ApproachStop, DriveToFeedback, DriveToGoal, DriveToResult, SeenMotion,
+        Sighting,
     },
     mobility::{DriveArc, DriveResult, WheelsState},
     status::work,
@@ -39,6 +42,8 @@ const HIDING_M: f64 = 0.01;
 const MAX_STOPS_N: u32 = 60;
 /// Movements back from where no way is clear, in one approach.
 const RETREATS_N: u32 = 3;
+/// What the prediction of a pixel may be off besides, px.
+const UNKNOWN_PX: f64 = 1.0;
 /// Stops in a row at which the target may be missed.
 const MISSES_N: u32 = 1;
 /// The same while the rover's own body or the edge of its shadow passes over it.
@@ -57,6 +62,8 @@ pub(crate) struct Session<'a> {
     estimate: TargetEstimate,
     now: Frame,
     wheels: WheelsState,
+    /// What the left image of `now` shows of the ground.
+    landmarks: Vec<Landmark>,
     /// Points of the last frames, site frame, m.
     ground: Vec<Vec<Vector3<f64>>>,
     stops: Vec<ApproachStop>,
@@ -131,6 +138,7 @@ impl<'a> Session<'a> {
             estimate,
             now,
             wheels,
+            landmarks: Vec::new(),
             ground: Vec::new(),
             stops: Vec::new(),
             driven_m: 0.0,
@@ -225,7 +233,6 @@ impl<'a> Session<'a> {
         }
         let now_from_last = done.before_from_after().isometry.inverse();
         let motion = Motion::from_drive(now_from_last, &done.covariance, done.state.tilt_sigma_rad);
-        self.estimate = self.estimate.predicted(&motion);
         self.track(&motion, near).await?;
         let sigma = sigma_mm(&self.estimate.covariance_m2);
         let worst = sigma.iter().fold(0.0_f64, |m, s| m.max(*s));
@@ -244,8 +251,13 @@ impl<'a> Session<'a> {
 
     /// Points the mast at the target, takes an image, finds the target; another image of the same
     /// stop after a refusal.
-    async fn track(&mut self, motion: &Motion, near: bool) -> Result<(), Fault> {
+    async fn track(&mut self, odometry: &Motion, near: bool) -> Result<(), Fault> {
+        let last = self.estimate;
+        self.estimate = last.predicted(odometry);
         self.point_at(&self.estimate.position_m.clone()).await?;
+        let pointing_rad = self.mast.quality.pointing_deg.to_radians();
+        let quality = &self.robot.description().model_quality;
+        let mount_rad = quality.angle_deg.to_radians();
         let mut sightings = Vec::new();
         for exposure_n in 0..2 {
             let frame = self
@@ -255,13 +267,16 @@ impl<'a> Session<'a> {
             let wheels = wheels_of(&frame)?;
             let camera = &frame.view.cameras.left;
             let focal_px = camera.model.cahv()[2].norm();
-            let pointing = 1.5 * self.mast.quality.pointing_deg.to_radians() * focal_px;
+            let eye = camera.model.cahv()[0];
+            let expected = odometry.seen_from(eye, mount_rad, pointing_rad);
+            let seen = self.seen_motion(&frame, &expected);
+            let motion = seen.map_or(expected, |seen| seen.motion);
+            self.estimate = last.predicted(&motion);
             let spread = self
                 .estimate
-                .pixel_covariance(camera, pointing)
+                .pixel_covariance(camera, UNKNOWN_PX)
                 .ok_or_else(|| fault("target_lost", "the target is behind the camera"))?;
             let predicted_px = self.tracker.predicted_pixel(camera, &motion.now_from_last);
-            let eye = camera.model.cahv()[0];
             let found = if self.shade.hides(&self.estimate.position_m, eye, HIDING_M) {
                 Err(Refusal::hidden())
             } else {
@@ -281,7 +296,7 @@ impl<'a> Session<'a> {
             let fix = match found {
                 Ok(fix) => fix,
                 Err(refusal) if exposure_n > 0 => {
-                    return self.missed(motion, sightings, frame, wheels, &refusal);
+                    return self.missed(&motion, sightings, (frame, wheels, seen), &refusal);
                 }
                 Err(_) => continue,
             };
@@ -293,10 +308,28 @@ impl<'a> Session<'a> {
             self.budget.tracked(&fix, focal_px);
             (self.now, self.wheels) = (frame, wheels);
             self.remember_ground();
-            self.record(sightings, &fix);
+            self.record(sightings, seen, &fix);
             return Ok(());
         }
         Err(fault("target_lost", "no image was accepted"))
+    }
+
+    /// The motion since the last stop as the pictures tell it, if they do.
+    fn seen_motion(&self, frame: &Frame, odometry: &Motion) -> Option<Egomotion> {
+        let views = [&*self.now.view, &*frame.view];
+        let usable = |view: &View, place: &Vector3<f64>| {
+            let eye = view.cameras.left.model.cahv()[0];
+            let shadow = view.own_shadow.as_ref();
+            !self.shade.hides(place, eye, HIDING_M)
+                && !self.shade.touches(place, HIDING_M)
+                && !shadow.is_some_and(|shadow| shadow.has_edge_at(place))
+        };
+        let rules = EgomotionRules::default();
+        let seen = self.hardware.shell.timed(work::VISION, || {
+            egomotion(views, &self.landmarks, odometry, usable, &rules)
+        });
+        seen.inspect_err(|reason| tracing::debug!(%reason, "odometry alone tells the motion"))
+            .ok()
     }
 
     /// The target was not found in either image of a stop. While the position is still known well
@@ -306,8 +339,7 @@ impl<'a> Session<'a> {
         &mut self,
         motion: &Motion,
         sightings: Vec<Sighting>,
-        frame: Frame,
-        wheels: WheelsState,
+        (frame, wheels, seen): (Frame, WheelsState, Option<Egomotion>),
         refusal: &Refusal,
     ) -> Result<(), Fault> {
         self.missed_n += 1;
@@ -331,17 +363,17 @@ impl<'a> Session<'a> {
         self.tracker.coast(&motion.now_from_last);
         (self.now, self.wheels) = (frame, wheels);
         self.remember_ground();
-        self.note_stop(sightings);
+        self.note_stop(sightings, seen);
         Ok(())
     }
 
-    fn record(&mut self, sightings: Vec<Sighting>, fix: &Fix) {
+    fn record(&mut self, sightings: Vec<Sighting>, seen: Option<Egomotion>, fix: &Fix) {
         self.missed_n = 0;
-        self.note_stop(sightings);
+        self.note_stop(sightings, seen);
         self.tell_sighting(fix.pixel_px.into(), fix.score);
     }
 
-    fn note_stop(&mut self, sightings: Vec<Sighting>) {
+    fn note_stop(&mut self, sightings: Vec<Sighting>, seen: Option<Egomotion>) {
         let stop_n = self.stops.len() as u32 + 1;
         self.stops.push(ApproachStop {
             stop_n,
@@ -352,6 +384,11 @@ impl<'a> Session<'a> {
             position_m: self.estimate.position_m.into(),
             sigma_mm: sigma_mm(&self.estimate.covariance_m2),
             slip: self.wheels.slip,
+            seen_motion: seen.map(|seen| SeenMotion {
+                agreeing_n: seen.agreeing_n as u32,
+                found_n: seen.found_n as u32,
+                rms_px: seen.rms_px,
+            }),
         });
     }
 

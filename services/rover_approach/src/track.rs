@@ -30,6 +30,10 @@ pub struct Tracker {
     surface: StereoPlane,
 }
 
+/// A search that reaches no farther, template px, holds one peak, and no second one that is unlike
+/// its slopes.
+const UNIQUE_PX: usize = 10;
+
 /// A fix before it is accepted.
 struct Candidate {
     warp: PlaneWarp,
@@ -198,7 +202,8 @@ impl Tracker {
                 rows: 2 * reach.v + 1,
             });
         }
-        if !(score - second_score >= gate.min_margin) {
+        let is_wide = reach.u.max(reach.v) > UNIQUE_PX;
+        if is_wide && !(score - second_score >= gate.min_margin) {
             return Err(TrackError::NotUnique {
                 score,
                 second_score,

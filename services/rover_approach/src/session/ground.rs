@@ -1,6 +1,7 @@
 //! The ground as the mast has seen it on the way.
 
 use super::Session;
+use crate::egomotion::Landmark;
 use crate::hardware::Frame;
 use crate::obstacles::{GroundMap, GroundRules};
 use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
@@ -35,13 +36,14 @@ impl Session<'_> {
 
     pub(super) fn remember_ground(&mut self) {
         let frame = self.now.clone();
-        self.remember(&frame);
+        self.landmarks = self.remember(&frame);
     }
 
-    /// Adds a frame's points to the ground known; those of old frames are forgotten.
-    fn remember(&mut self, frame: &Frame) {
+    /// Adds a frame's points to the ground known; those of old frames are forgotten. Returns them
+    /// as landmarks.
+    fn remember(&mut self, frame: &Frame) -> Vec<Landmark> {
         let Some(site_from_rover) = frame.frame.site_from_rover() else {
-            return;
+            return Vec::new();
         };
         let view = &frame.view;
         let rules = MatchRules {
@@ -52,7 +54,9 @@ impl Session<'_> {
         let points = self.hardware.shell.timed(work::VISION, || {
             sparse_points(&view.left, &view.right, &view.cameras, MAP_STEP_PX, &rules)
         });
-        let Ok(points) = points else { return };
+        let Ok(points) = points else {
+            return Vec::new();
+        };
         let [half_x, half_y] = self.mobility.footprint_half_m;
         let own = |p: &Vector3<f64>| {
             let below = p.x.abs() < half_x + OWN_M && p.y.abs() < half_y + OWN_M;
@@ -67,6 +71,8 @@ impl Session<'_> {
         if self.ground.len() > MAP_FRAMES {
             self.ground.remove(0);
         }
+        let landmark = |(pixel_px, point_m)| Landmark { pixel_px, point_m };
+        points.into_iter().map(landmark).collect()
     }
 
     /// The ground known, in the levelled rover frame.
