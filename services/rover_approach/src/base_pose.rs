@@ -6,6 +6,7 @@
 //! freely the tip moves, how far the joints are from their limits, and how much lies between the
 //! wheels and the limits of the ground.
 
+use crate::drive::aim_of;
 use crate::obstacles::{GroundMap, PlanarPose, Standing};
 use crate::shade::Shade;
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector2, Vector3};
@@ -249,7 +250,15 @@ impl BaseTask<'_> {
         let mut found = self.serve(&spot)?;
         let room = 1.0 - standing.slope_rad / self.rules.max_slope_rad;
         // A turn shows the target from another side, which costs more than its way.
-        let way = Vector2::new(pose.x_m, pose.y_m).norm() + 2.0 * pose.heading_rad.abs();
+        let place = Vector2::new(pose.x_m, pose.y_m);
+        let distance_m = place.norm();
+        let (aim, _) = aim_of(&place);
+        let turns_rad = if distance_m < 0.08 {
+            pose.heading_rad.abs()
+        } else {
+            aim.abs() + (pose.heading_rad - aim).abs()
+        };
+        let way = distance_m + 2.0 * turns_rad;
         found.score +=
             0.3 * room + 0.5 * standing.belly_m.min(0.2) - 0.1 * way - standing.unevenness_m;
         found.pose = *pose;

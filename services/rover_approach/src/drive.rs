@@ -147,9 +147,9 @@ pub fn next_movement(
     })
 }
 
-/// The next movement to stand at `pose`: turn towards it, drive straight (backwards if it lies
-/// behind) at most `step_m`, turn to its heading. `None` if that is not clear, or the pose is
-/// reached.
+/// The next movements to stand at `pose`: turn towards it, drive straight (backwards if it lies
+/// behind) at most `step_m`, turn to its heading. They end where more than one largest turn would
+/// be made at once. `None` if the way is not clear, or the pose is reached.
 #[must_use]
 pub fn towards_pose(
     pose: &PlanarPose,
@@ -157,23 +157,40 @@ pub fn towards_pose(
     map: &GroundMap,
     mobility: &MobilityDescription,
     rules: &DriveRules,
-) -> Option<Movement> {
+) -> Option<Vec<Movement>> {
+    /// Smaller angles are not worth a turn of their own.
     const AIM_RAD: f64 = 0.06;
-    let bounded = |angle: f64| angle.clamp(-rules.max_turn_rad, rules.max_turn_rad);
+    const HEADING_RAD: f64 = 0.02;
+    /// Nearer to the place than this only the heading is mended, m.
+    const NEAR_M: f64 = 0.08;
+    let most = rules.max_turn_rad;
     let place = Vector2::new(pose.x_m, pose.y_m);
     let distance = place.norm();
-    if distance <= rules.min_step_m.max(0.04) {
-        return (pose.heading_rad.abs() > 0.02).then(|| turn(bounded(pose.heading_rad)));
+    if distance <= NEAR_M {
+        let angle = pose.heading_rad.clamp(-most, most);
+        return (angle.abs() > HEADING_RAD).then(|| vec![turn(angle)]);
     }
-    let (aim, sign) = aim_of(&place);
     // the whole way must be clear, though only its beginning is driven
     if hazard_on_the_way(pose, map, mobility, rules).is_some() {
         return None;
     }
-    if aim.abs() > AIM_RAD && distance > 0.08 {
-        return Some(turn(bounded(aim)));
+    let (aim, sign) = aim_of(&place);
+    let mut way = Vec::new();
+    let mut turned = 0.0;
+    if aim.abs() > AIM_RAD {
+        turned = aim.clamp(-most, most);
+        way.push(turn(turned));
+        if turned != aim {
+            return Some(way);
+        }
     }
-    Some(straight(sign * distance.min(step_m)))
+    way.push(straight(sign * distance.min(step_m)));
+    let rest = pose.heading_rad - turned;
+    let all = (turned + rest).abs().max(turned.abs());
+    if distance <= step_m && rest.abs() > HEADING_RAD && rest.abs() <= most && all <= most {
+        way.push(turn(rest));
+    }
+    Some(way)
 }
 
 /// The first hazard on the straight way to a pose, and how far away it is, m.
@@ -201,7 +218,7 @@ pub fn hazard_on_the_way(
 }
 
 /// Heading in which a place is driven to, and 1 for forwards or -1 for backwards.
-fn aim_of(place: &Vector2<f64>) -> (f64, f64) {
+pub(crate) fn aim_of(place: &Vector2<f64>) -> (f64, f64) {
     let bearing = place.y.atan2(place.x);
     if bearing.abs() <= std::f64::consts::FRAC_PI_2 {
         (bearing, 1.0)

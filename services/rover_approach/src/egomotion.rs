@@ -36,6 +36,8 @@ pub struct EgomotionRules {
     pub neighbour_px: f64,
     /// The coarse and the fine search.
     pub stages: [Stage; 2],
+    /// Factor on odometry's covariance where it is weighed against landmarks.
+    pub prior_inflation: f64,
     /// Least landmarks that must agree.
     pub min_agreeing_n: usize,
     /// Least part of those found that must agree.
@@ -76,6 +78,7 @@ impl Default for EgomotionRules {
                     agree_px: 2.0,
                 },
             ],
+            prior_inflation: 25.0,
             min_agreeing_n: 8,
             min_agreeing: 0.5,
         }
@@ -135,6 +138,9 @@ pub fn egomotion(
             (mark, plane)
         })
         .collect();
+    // Many landmarks know better than odometry, whose errors are not all in its covariance; it only
+    // decides what they leave open.
+    let prior = odometry.covariance * rules.prior_inflation;
     let mut correction = Correction::identity();
     let mut known = odometry.covariance;
     let mut refusal = NoMotion {
@@ -162,7 +168,7 @@ pub fn egomotion(
             .collect();
         refusal.found_n = found.len();
         let start = (n > 0).then_some(correction);
-        let fit = Fit::of(&found, camera, &odometry.covariance, start, stage.agree_px).ok_or(refusal)?;
+        let fit = Fit::of(&found, camera, &prior, start, stage.agree_px).ok_or(refusal)?;
         refusal.agreeing_n = fit.agreeing_n;
         let least = rules.min_agreeing * found.len() as f64;
         if fit.agreeing_n < rules.min_agreeing_n || (fit.agreeing_n as f64) < least {

@@ -9,6 +9,10 @@ use crate::error::TrackError;
 use nalgebra::{Isometry3, Matrix2, Matrix3, Matrix6, Point3, SMatrix, Vector3, Vector6};
 use rover_cameras::Camera;
 
+/// How far a turn in place leads off its place, m per rad, one sigma: the wheels scrub, each by
+/// its load and soil.
+const WANDER_M: f64 = 0.01;
+
 /// One step of the rover as odometry and attitude sensor tell it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Motion {
@@ -39,6 +43,10 @@ impl Motion {
         let drive = Matrix3::from_fn(|i, j| drive[i][j]);
         let mut covariance = shape * drive * shape.transpose();
         let tilt = 2.0 * tilt_sigma_rad * tilt_sigma_rad;
+        let wander = WANDER_M * now_from_last.rotation.angle();
+        for k in 0..2 {
+            covariance[(k, k)] += wander * wander;
+        }
         covariance[(2, 2)] += 0.01 * 0.01 * now_from_last.translation.vector.norm_squared();
         for (k, floor) in [1e-8, 1e-8, 1e-8, tilt, tilt, 1e-10]
             .into_iter()
@@ -49,6 +57,23 @@ impl Motion {
         Self {
             now_from_last,
             covariance,
+        }
+    }
+
+    /// This motion and then another one.
+    #[must_use]
+    pub fn then(&self, next: &Self) -> Self {
+        let turn = next.now_from_last.rotation.to_rotation_matrix();
+        let shift = &next.now_from_last.translation.vector;
+        let mut carried = Matrix6::zeros();
+        carried.fixed_view_mut::<3, 3>(0, 0).copy_from(turn.matrix());
+        carried.fixed_view_mut::<3, 3>(3, 3).copy_from(turn.matrix());
+        carried
+            .fixed_view_mut::<3, 3>(0, 3)
+            .copy_from(&(shift.cross_matrix() * turn.matrix()));
+        Self {
+            now_from_last: next.now_from_last * self.now_from_last,
+            covariance: carried * self.covariance * carried.transpose() + next.covariance,
         }
     }
 
@@ -272,6 +297,42 @@ mod tests {
         }
         let drawn = sum / f64::from(n);
         let difference = (drawn - predicted.covariance_m2).norm() / drawn.norm();
+        assert!(difference < 0.03, "{difference}");
+    }
+
+    #[test]
+    fn two_motions_spread_a_point_as_drawn_ones_one_after_the_other_do() {
+        let model = OdometryModel::default();
+        let pose = |x: f64, yaw: f64| {
+            let turn = UnitQuaternion::from_euler_angles(0.03, -0.02, yaw);
+            Isometry3::from_parts(Vector3::new(x, 0.2 * x, 0.01).into(), turn)
+        };
+        let places = [pose(0.0, 0.0), pose(0.1, 0.9), pose(0.9, 0.5)];
+        let motions = [0, 1].map(|k| model.motion(&places[k], &places[k + 1]));
+        let both = motions[0].then(&motions[1]);
+        let point = Vector3::new(2.0, -0.7, 0.3);
+        let expected = TargetEstimate {
+            position_m: point,
+            covariance_m2: Matrix3::zeros(),
+        }
+        .predicted(&both);
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(7);
+        let mut sum = Matrix3::zeros();
+        let n = 40_000;
+        for _ in 0..n {
+            let mut at = point;
+            for motion in &motions {
+                let root = motion.covariance.cholesky().unwrap().l();
+                let error = root * Vector6::from_fn(|_, _| normal(&mut rng));
+                let turn = UnitQuaternion::from_scaled_axis(error.fixed_rows::<3>(3).into_owned());
+                at = turn * (motion.now_from_last * Point3::from(at)).coords
+                    + error.fixed_rows::<3>(0);
+            }
+            let d = at - expected.position_m;
+            sum += d * d.transpose();
+        }
+        let drawn = sum / f64::from(n);
+        let difference = (drawn - expected.covariance_m2).norm() / drawn.norm();
         assert!(difference < 0.03, "{difference}");
     }
 

@@ -30,7 +30,7 @@ use rover_messages::{
     status::work,
 };
 use rover_robot::{MastDescription, MobilityDescription, Robot};
-use std::sync::Arc;
+use std::{collections::BTreeMap, sync::Arc};
 
 /// Range at which the base pose is chosen, m along the ground.
 const NEAR_M: f64 = 3.2;
@@ -80,6 +80,10 @@ pub(crate) struct Session<'a> {
     missed_n: u32,
     /// The base pose that is driven to, site frame.
     aim: Option<PlanarPose>,
+    /// Base poses that were reached and do not serve, site frame.
+    spent: Vec<PlanarPose>,
+    /// Candidates of the last choice of a base pose, and how many were refused why.
+    candidates: (u32, BTreeMap<String, u32>),
     /// The target's normal as the body cameras saw it, site frame.
     normal_in_site: Option<Vector3<f64>>,
     /// Base poses chosen anew after a look of the body cameras.
@@ -148,6 +152,8 @@ impl<'a> Session<'a> {
             shade,
             missed_n: 0,
             aim: None,
+            spent: Vec::new(),
+            candidates: (0, BTreeMap::new()),
             normal_in_site: None,
             second_choices_n: 0,
         };
@@ -160,17 +166,17 @@ impl<'a> Session<'a> {
             let range_m = self.estimate.position_m.xy().norm();
             self.tell(ApproachActivity::Planning);
             self.look_ahead().await?;
-            let arc = if range_m > NEAR_M {
+            let arcs = if range_m > NEAR_M {
                 let shell = self.hardware.shell;
-                shell.timed(work::PLANNING, || self.far_movement(range_m))?
+                vec![shell.timed(work::PLANNING, || self.far_movement(range_m))?]
             } else {
                 let shell = self.hardware.shell;
                 match shell.timed(work::PLANNING, || self.near_movement())? {
-                    NearStep::Move(arc) => {
+                    NearStep::Move(arcs) => {
                         self.near_moves_n += 1;
-                        arc
+                        arcs
                     }
-                    NearStep::Stay(serving, choice) => match self.finish(serving, choice).await? {
+                    NearStep::Stay(serving) => match self.finish(serving).await? {
                         Finish::Reached(result) => return Ok(*result),
                         Finish::Otherwise => continue,
                     },
@@ -181,8 +187,15 @@ impl<'a> Session<'a> {
                 return Err(fault("too_many_stops", format!("{limit} stops made")));
             }
             self.tell(ApproachActivity::Driving);
-            let done = self.hardware.drive(arc, self.goal.limits.max_slip).await?;
-            self.after_drive(&done, range_m <= NEAR_M).await?;
+            let mut motion: Option<Motion> = None;
+            for arc in arcs {
+                let done = self.hardware.drive(arc, self.goal.limits.max_slip).await?;
+                let next = self.driven(&done)?;
+                motion = Some(motion.map_or(next, |before| before.then(&next)));
+            }
+            if let Some(motion) = motion {
+                self.look(&motion, range_m <= NEAR_M).await?;
+            }
         }
     }
 
@@ -206,8 +219,8 @@ impl<'a> Session<'a> {
         Err(fault("path_blocked", blocked.to_string()).with("range_m", range_m))
     }
 
-    /// After a movement: where is the target now, and is everything within its limits?
-    async fn after_drive(&mut self, done: &DriveResult, near: bool) -> Result<(), Fault> {
+    /// The motion that a movement was, if everything stayed within its limits.
+    fn driven(&mut self, done: &DriveResult) -> Result<Motion, Fault> {
         let way = match done.before_from_after().isometry.translation.vector.norm() {
             way if way.is_finite() => way,
             other => return Err(fault("bad_odometry", format!("a way of {other} m"))),
@@ -232,8 +245,16 @@ impl<'a> Session<'a> {
             ));
         }
         let now_from_last = done.before_from_after().isometry.inverse();
-        let motion = Motion::from_drive(now_from_last, &done.covariance, done.state.tilt_sigma_rad);
-        self.track(&motion, near).await?;
+        Ok(Motion::from_drive(
+            now_from_last,
+            &done.covariance,
+            done.state.tilt_sigma_rad,
+        ))
+    }
+
+    /// After a motion: where is the target now, and is it known well enough?
+    async fn look(&mut self, motion: &Motion, near: bool) -> Result<(), Fault> {
+        self.track(motion, near).await?;
         let sigma = sigma_mm(&self.estimate.covariance_m2);
         let worst = sigma.iter().fold(0.0_f64, |m, s| m.max(*s));
         if let Some(limit) = self.goal.limits.max_sigma_mm
@@ -256,8 +277,7 @@ impl<'a> Session<'a> {
         self.estimate = last.predicted(odometry);
         self.point_at(&self.estimate.position_m.clone()).await?;
         let pointing_rad = self.mast.quality.pointing_deg.to_radians();
-        let quality = &self.robot.description().model_quality;
-        let mount_rad = quality.angle_deg.to_radians();
+        let mount_rad = self.mast.quality.angle_deg.to_radians();
         let mut sightings = Vec::new();
         for exposure_n in 0..2 {
             let frame = self

@@ -1,7 +1,7 @@
 //! The end of the approach: first ray, hand-over, and the target as the body pair sees it.
 
 use super::Session;
-use crate::base_pose::{BaseChoice, BaseRules, Serving, TargetSpot};
+use crate::base_pose::{BaseRules, Serving, TargetSpot};
 use crate::first_ray::{FirstRayRules, first_ray};
 use crate::handover::{HandoverRules, hand_over};
 use crate::hardware::fault;
@@ -28,11 +28,7 @@ pub(super) enum Finish {
 
 impl Session<'_> {
     /// First ray, hand-over, and the target as the body pair sees it.
-    pub(super) async fn finish(
-        &mut self,
-        serving: Serving,
-        choice: BaseChoice,
-    ) -> Result<Finish, Fault> {
+    pub(super) async fn finish(&mut self, serving: Serving) -> Result<Finish, Fault> {
         self.tell(ApproachActivity::HandingOver);
         let view = Arc::clone(&self.now.view);
         if self.spot_offset_m.is_none()
@@ -53,15 +49,18 @@ impl Session<'_> {
             .angle_deg
             .to_radians();
         let rules = HandoverRules::for_mounts(mount_rad, focal_px);
-        let found = self
-            .hardware
-            .shell
-            .timed(work::VISION, || {
-                hand_over(&view, pixel, surface, &body.view, &rules)
-            })
-            .map_err(|e| fault("handover_failed", e.to_string()))?;
+        let found = self.hardware.shell.timed(work::VISION, || {
+            hand_over(&view, pixel, surface, &body.view, &rules)
+        });
+        let found = match found {
+            Ok(found) => found,
+            Err(e) => return self.elsewhere(fault("handover_failed", e.to_string())),
+        };
         self.budget.handed(&found, focal_px);
-        let mut target = self.acceptable(&found.pixel_px, &found.surface).await?;
+        let mut target = match self.acceptable(&found.pixel_px, &found.surface).await {
+            Ok(target) => target,
+            Err(refusal) => return self.elsewhere(refusal),
+        };
         let spot = TargetSpot {
             position_m: target.position_m.coords,
             normal: target.normal.unit.into_inner(),
@@ -97,12 +96,23 @@ impl Session<'_> {
             base: BasePose {
                 pose: self.wheels.pose,
                 quality: quality.map(|(name, x)| (name.to_string(), x)).into(),
-                candidates_n: choice.candidates_n,
-                refused: choice.refused,
+                candidates_n: self.candidates.0,
+                refused: self.candidates.1.clone(),
             },
             stops: self.stops.clone(),
             driven_m: self.driven_m,
         })))
+    }
+
+    /// The body cameras do not see the target well enough from here: another base pose is chosen.
+    fn elsewhere(&mut self, refusal: Fault) -> Result<Finish, Fault> {
+        if self.second_choices_n >= SECOND_CHOICES_N {
+            return Err(refusal);
+        }
+        self.second_choices_n += 1;
+        self.spent.push(self.standing());
+        self.aim = None;
+        Ok(Finish::Otherwise)
     }
 
     /// From near the surface turned out to face another way than from afar, so that the arm cannot

@@ -1,6 +1,6 @@
 //! The last metres: which base pose to take, and the movement towards it.
 
-use super::Session;
+use super::{RETREATS_N, Session};
 use crate::base_pose::{BaseChoice, BaseRules, BaseTask, Serving, TargetSpot};
 use crate::drive::{Movement, hazard_on_the_way, next_movement, straight, towards_pose};
 use crate::hardware::fault;
@@ -22,18 +22,28 @@ const RETREAT_M: f64 = 0.4;
 /// A pose in which the arm works worse than in the best by no more than this is not left.
 const GOOD_ENOUGH: f64 = 0.15;
 /// Close enough to the chosen base pose: m, rad.
-const ARRIVED: (f64, f64) = (0.06, 0.08);
-/// Movements near the target after which any pose that serves is taken.
-const PATIENCE_N: u32 = 14;
+const ARRIVED: (f64, f64) = (0.08, 0.08);
+/// Movements near the target after which any pose with room that serves is taken, and after which
+/// none is made.
+const PATIENCE_N: u32 = 10;
+const LAST_MOVE_N: u32 = 25;
+/// Farther from the target than this a turn may be larger in proportion, m: it shows the target
+/// from as much of another side.
+const NEAR_TURN_M: f64 = 1.2;
 
 #[allow(clippy::large_enum_variant)] // one lives at a time
 pub(super) enum NearStep {
-    Move(DriveArc),
-    Stay(Serving, BaseChoice),
+    /// Movements one after the other, without a look between them.
+    Move(Vec<DriveArc>),
+    Stay(Serving),
 }
 
 impl Session<'_> {
-    /// The movement to the best base pose that can be driven to, or the decision to stay.
+    /// The movements to the best base pose that can be driven to, or the decision to stay.
+    ///
+    /// A base pose once chosen is kept while it serves: each look measures target and ground a
+    /// little differently, and another pose would be the best one every time. One that was reached
+    /// and does not serve is not chosen again, so that this comes to an end.
     pub(super) fn near_movement(&mut self) -> Result<NearStep, Fault> {
         let (_, surface) = self.tracker.target();
         let spot = TargetSpot {
@@ -41,76 +51,85 @@ impl Session<'_> {
             normal: self.seen_normal().unwrap_or(surface.plane.normal),
         };
         let map = self.map();
+        let range_m = self.estimate.position_m.xy().norm();
+        let mut rules = self.rules;
+        rules.max_turn_rad *= (range_m / NEAR_TURN_M).max(1.0);
+        let step_m = (rules.step_fraction * range_m).max(0.15);
+        let seen = self.missed_n == 0;
+        let here = self.served_from_here(&spot, &BaseRules::at_the_limit())?;
+        if let Some(aim) = self.aim.take() {
+            let pose = self.in_level(&aim);
+            let is_there = Vector2::new(pose.x_m, pose.y_m).norm() <= ARRIVED.0
+                && pose.heading_rad.abs() <= ARRIVED.1;
+            if is_there {
+                if let (Ok(serving), true) = (&here, seen) {
+                    return Ok(NearStep::Stay(serving.clone()));
+                }
+                self.spent.push(aim);
+            } else if let Some(way) = towards_pose(&pose, step_m, &map, self.mobility, &rules) {
+                let limit = BaseRules::at_the_limit();
+                let task = self.task(&limit)?;
+                if task.judge(&pose, &self.levelled(&spot), &map).is_ok() {
+                    self.aim = Some(aim);
+                    return Ok(NearStep::Move(arcs(&way)));
+                }
+            }
+        }
         let (spot, choice) = match self.choose(&spot, &map) {
             Ok(choice) => (spot, choice),
             Err(refusal) => self.other_spot(&map).ok_or(refusal)?,
         };
-        let rules = BaseRules::at_the_limit();
-        let task = self.task(&rules)?;
-        // Where the body cameras have refused a pose already, one is not enough that just serves.
-        let required = if self.second_choices_n > 0 {
-            BaseRules::default()
-        } else {
-            BaseRules::at_the_limit()
-        };
-        let here = self.served_from_here(&spot, &required)?;
         let best_arm = choice.serving.iter().map(|s| s.arm_score);
         let best_arm = best_arm.fold(f64::NEG_INFINITY, f64::max);
-        if let (Ok(serving), Some(best)) = (&here, choice.serving.first()) {
-            let away = Vector2::new(best.pose.x_m, best.pose.y_m).norm();
-            let arrived = away <= ARRIVED.0 && best.pose.heading_rad.abs() <= ARRIVED.1
-                || serving.arm_score >= best_arm - GOOD_ENOUGH;
-            if self.missed_n == 0 && (arrived || self.near_moves_n >= PATIENCE_N) {
-                return Ok(NearStep::Stay(serving.clone(), choice));
-            }
+        // To be stayed at without having been aimed at, a pose must have room, as one aimed at has.
+        let roomy = self.served_from_here(&spot, &BaseRules::default())?;
+        self.candidates = (choice.candidates_n, choice.refused.clone());
+        if let (Ok(serving), true) = (roomy, seen)
+            && (serving.arm_score >= best_arm - GOOD_ENOUGH || self.near_moves_n >= PATIENCE_N)
+        {
+            return Ok(NearStep::Stay(serving));
         }
-        // A base pose once chosen is kept while it serves: each look measures target and ground a
-        // little differently, and another pose would be the best one every time.
-        let kept = self
-            .aim
-            .map(|aim| self.in_level(&aim))
-            .filter(|pose| task.judge(pose, &self.levelled(&spot), &map).is_ok());
-        let range_m = self.estimate.position_m.xy().norm();
-        let step_m = (self.rules.step_fraction * range_m).max(0.15);
         // the best first; the next ones are the second candidates if the way to it is blocked
-        let others = choice.serving.iter().map(|serving| serving.pose);
-        let way = kept.into_iter().chain(others.clone()).find_map(|pose| {
-            let movement = towards_pose(&pose, step_m, &map, self.mobility, &self.rules)?;
-            Some((pose, movement))
+        let poses = || choice.serving.iter().map(|serving| serving.pose);
+        let straight = poses().find_map(|pose| {
+            let way = towards_pose(&pose, step_m, &map, self.mobility, &rules)?;
+            Some((pose, way))
         });
         // Where no straight way is clear an arc may lead around, or a way back to look again.
-        let way = way.or_else(|| {
-            if self.near_moves_n >= PATIENCE_N {
-                return None;
-            }
-            let around = others.clone().take(AROUND_N).find_map(|pose| {
+        let way = straight.or_else(|| {
+            poses().take(AROUND_N).find_map(|pose| {
                 let goal = Vector2::new(pose.x_m, pose.y_m);
-                next_movement(&goal, range_m, &map, self.mobility, &self.rules)
-                    .ok()
-                    .map(|movement| (pose, movement))
-            });
-            around.or_else(|| Some((others.clone().next()?, self.backwards(&map)?)))
+                let arc = next_movement(&goal, range_m, &map, self.mobility, &rules);
+                Some((pose, vec![arc.ok()?]))
+            })
         });
-        self.aim = way.map(|(pose, _)| self.in_site(&pose));
-        let movement = way.map(|(_, movement)| movement);
-        match (movement, here) {
-            (Some(movement), _) => Ok(NearStep::Move(movement.arc)),
-            (None, Ok(serving)) => Ok(NearStep::Stay(serving, choice)),
-            (None, Err(reason)) => {
-                let n = choice.serving.len();
-                let nearest = choice.serving.first().and_then(|best| {
-                    hazard_on_the_way(&best.pose, &map, self.mobility, &self.rules)
-                });
-                let what = nearest.map_or_else(String::new, |(away_m, hazard)| {
-                    format!("; on the way to the best one, {away_m:.2} m away: {hazard}")
-                });
-                let message = format!(
-                    "no way is clear to any of {n} base poses{what}; where the rover stands: \
-                     {reason}"
-                );
-                Err(fault("path_blocked", message).with("range_m", range_m))
-            }
+        if let Some((pose, way)) = way
+            && self.near_moves_n < LAST_MOVE_N
+        {
+            self.aim = Some(self.in_site(&pose));
+            return Ok(NearStep::Move(arcs(&way)));
         }
+        if self.retreats_n < RETREATS_N
+            && let Some(back) = self.backwards(&map)
+        {
+            self.retreats_n += 1;
+            return Ok(NearStep::Move(vec![back.arc]));
+        }
+        let reason = match here {
+            Ok(serving) => return Ok(NearStep::Stay(serving)),
+            Err(reason) => reason,
+        };
+        let n = choice.serving.len();
+        let nearest = choice
+            .serving
+            .first()
+            .and_then(|best| hazard_on_the_way(&best.pose, &map, self.mobility, &rules));
+        let what = nearest.map_or_else(String::new, |(away_m, hazard)| {
+            format!("; on the way to the best one, {away_m:.2} m away: {hazard}")
+        });
+        let message =
+            format!("no way is clear to any of {n} base poses{what}; where the rover stands: {reason}");
+        Err(fault("path_blocked", message).with("range_m", range_m))
     }
 
     fn choose(&self, spot: &TargetSpot, map: &GroundMap) -> Result<BaseChoice, Fault> {
@@ -230,7 +249,9 @@ impl Session<'_> {
                 .goal
                 .avoid
                 .iter()
-                .map(|p| self.in_level(&planar(p)))
+                .map(planar)
+                .chain(self.spent.iter().copied())
+                .map(|p| self.in_level(&p))
                 .collect(),
         })
     }
@@ -244,7 +265,7 @@ impl Session<'_> {
     }
 
     /// Where the rover stands, site frame.
-    fn standing(&self) -> PlanarPose {
+    pub(super) fn standing(&self) -> PlanarPose {
         planar(&self.wheels.pose)
     }
 
@@ -269,6 +290,10 @@ impl Session<'_> {
             heading_rad: turn - whole * (turn / whole).round(),
         }
     }
+}
+
+fn arcs(way: &[Movement]) -> Vec<DriveArc> {
+    way.iter().map(|movement| movement.arc).collect()
 }
 
 fn planar(pose: &SitePose) -> PlanarPose {
