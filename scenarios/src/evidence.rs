@@ -145,6 +145,10 @@ impl Evidence {
 
     pub(crate) async fn after_contact(&mut self, peer: &Peer, limit: Duration) {
         self.in_contact(peer, limit).await;
+        self.after_servo(peer, limit).await;
+    }
+
+    pub(crate) async fn after_servo(&mut self, peer: &Peer, limit: Duration) {
         self.scene_view = kept("view", view(peer, &WIDE, About::Tip, limit).await);
     }
 }

@@ -224,7 +224,7 @@ fn images(evidence: &Evidence) -> Result<String, PageError> {
             figures += &figure(image, &Overlay { marks, path }, &caption)?;
         }
         out += &section(
-            "At the standoff",
+            "Where the servo ended",
             &format!("<div class=\"pair\">{figures}</div>"),
         );
     }

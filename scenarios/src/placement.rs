@@ -173,13 +173,17 @@ impl<'a> Mission<'a> {
     /// To the standoff and on to contact.
     async fn place_from_here(&mut self, record: &mut Record, target: &Target) -> Result<(), Fault> {
         let (peer, question_limit) = (self.peer, self.scenario.limits.question());
-        let placed = self.reach_standoff(target).await?;
+        let placed = self.reach_standoff(target).await;
         if let Some(evidence) = &mut self.evidence {
-            evidence.looks.clone_from(&placed.looks);
             evidence
                 .at_standoff(peer, &target.pair, question_limit)
                 .await;
+            match &placed {
+                Ok(placed) => evidence.looks.clone_from(&placed.looks),
+                Err(_) => evidence.after_servo(peer, question_limit).await,
+            }
         }
+        let placed = placed?;
         record.placed = Some(placed.clone());
         if self.is_simulated().await {
             let truth: TruthState = self.ask(keys::SIM_TRUTH_STATE, &Nothing {}).await?;

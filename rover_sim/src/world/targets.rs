@@ -16,8 +16,9 @@ use std::f64::consts::FRAC_PI_4;
 const FACING_RAD: f64 = 1.0;
 /// A picked surface on a rock lies so much above the ground at most, m.
 const HIGHEST_M: f64 = 0.30;
-/// Half the width of the field before the rover in which places are picked, rad.
-const AHEAD_RAD: f64 = 0.5;
+/// Half the width of the field before the rover in which places are looked for, and where there is
+/// none, rad.
+const AHEAD_RAD: [f64; 2] = [0.5, 0.9];
 /// Rocks smaller than this are not picked, m.
 const ROCK_M: f64 = 0.10;
 
@@ -98,14 +99,15 @@ impl World {
         random.set_stream(40 + u64::from(request.choice_n));
         let yaw = world_from_rover.rotation.euler_angles().2;
         let [near, far] = request.range_m;
-        // A person prefers the middle of a surface, and takes what there is.
-        let margins = MARGINS_RAD
+        // A person looks ahead first, prefers the middle of a surface, and takes what there is.
+        let wishes = AHEAD_RAD
             .into_iter()
-            .flat_map(|m| (0..TRIES).map(move |_| m));
-        for margin_rad in margins {
+            .flat_map(|ahead| MARGINS_RAD.map(|margin| (ahead, margin)));
+        let tried_n = wishes.clone().count() as u32 * TRIES;
+        for (ahead_rad, margin_rad) in wishes.flat_map(|w| (0..TRIES).map(move |_| w)) {
             let [u, v]: [f64; 2] = std::array::from_fn(|_| random.random());
             let range = near + u * (far - near);
-            let azimuth = yaw + (2.0 * v - 1.0) * AHEAD_RAD;
+            let azimuth = yaw + (2.0 * v - 1.0) * ahead_rad;
             let lift = 0.4 * random.random::<f64>();
             let origin = world_from_rover.translation.vector;
             let (x, y) = (
@@ -154,9 +156,8 @@ impl World {
                 pixel_px,
             });
         }
-        let tried_n = TRIES * MARGINS_RAD.len() as u32;
         let message = format!(
-            "no {:?} between {near} and {far} m that faces the rover, {TRIES} places tried",
+            "no {:?} between {near} and {far} m that faces the rover, {tried_n} places tried",
             request.surface
         );
         Err(Fault::new(HARDWARE, "no_place", message).with("tried_n", f64::from(tried_n)))

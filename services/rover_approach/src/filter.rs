@@ -66,8 +66,12 @@ impl Motion {
         let turn = next.now_from_last.rotation.to_rotation_matrix();
         let shift = &next.now_from_last.translation.vector;
         let mut carried = Matrix6::zeros();
-        carried.fixed_view_mut::<3, 3>(0, 0).copy_from(turn.matrix());
-        carried.fixed_view_mut::<3, 3>(3, 3).copy_from(turn.matrix());
+        carried
+            .fixed_view_mut::<3, 3>(0, 0)
+            .copy_from(turn.matrix());
+        carried
+            .fixed_view_mut::<3, 3>(3, 3)
+            .copy_from(turn.matrix());
         carried
             .fixed_view_mut::<3, 3>(0, 3)
             .copy_from(&(shift.cross_matrix() * turn.matrix()));

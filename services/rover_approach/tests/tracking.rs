@@ -2,6 +2,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
 use nalgebra::{Isometry3, Matrix2, Point3, UnitQuaternion, Vector2, Vector3};
+use rover_approach::egomotion::{EgomotionRules, Landmark, egomotion};
+use rover_approach::filter::Motion;
 use rover_approach::handover::{HandoverRules, hand_over};
 use rover_approach::surface::SurfacePlane;
 use rover_approach::view::View;
@@ -216,4 +218,82 @@ fn a_warp_carries_every_point_of_its_plane() {
         normal: Vector3::x(),
     };
     assert!(PlaneWarp::new(camera, &pixel, &behind).is_none());
+}
+
+/// Places of the ground that a view's left image shows, every 20 px, as stereo would put them.
+fn landmarks(cameras: &StereoPair, site_from_rover: &Isometry3<f64>) -> Vec<Landmark> {
+    let camera = cameras.left.transformed(site_from_rover);
+    let pixels = (1..11).flat_map(|v| (1..18).map(move |u| [u, v].map(|k| f64::from(k) * 20.0)));
+    pixels
+        .filter_map(|pixel| {
+            let pixel_px = Vector2::from(pixel);
+            let ray = camera.ray(&pixel_px).ok()?;
+            let range = -ray.origin.z / ray.direction.z;
+            let place = site_from_rover.inverse() * Point3::from(ray.at(range));
+            (range > 0.0).then_some(Landmark {
+                pixel_px,
+                point_m: place.coords,
+            })
+        })
+        .collect()
+}
+
+/// Views of two stops, landmarks of the first, odometry that is off by `error`, and the truth.
+fn two_stops(
+    error: Isometry3<f64>,
+    seeds: [u64; 2],
+) -> ([Arc<View>; 2], Vec<Landmark>, Motion, Isometry3<f64>) {
+    let [last, now] = [pose(0.4, 0.0), pose(1.0, 0.05)];
+    let [before, after] = [mast(&last).0, mast(&now).0];
+    let marks = landmarks(&before, &last);
+    let truth = now.inverse() * last;
+    let drive = [[4e-4, 0.0, 0.0], [0.0, 1e-4, 0.0], [0.0, 0.0, 4e-4]];
+    let odometry = Motion::from_drive(error * truth, &drive, 0.004);
+    let views = [view(&before, &last, seeds[0]), view(&after, &now, seeds[1])];
+    (views, marks, odometry, truth)
+}
+
+#[test]
+fn landmarks_tell_the_motion_that_odometry_has_wrong_by_a_degree() {
+    let error = Isometry3::from_parts(
+        Vector3::new(0.03, -0.012, 0.004).into(),
+        UnitQuaternion::from_euler_angles(0.003, -0.004, 0.018),
+    );
+    let ([last, now], marks, odometry, truth) = two_stops(error, [1, 1]);
+    let rules = EgomotionRules::default();
+    let everywhere = |_: &View, _: &Vector3<f64>| true;
+    let seen = egomotion([&last, &now], &marks, &odometry, everywhere, &rules).unwrap();
+    let camera = &now.cameras.left;
+    for mark in marks.iter().step_by(7) {
+        let pixel = |motion: &Isometry3<f64>| {
+            camera
+                .project(&(motion * Point3::from(mark.point_m)).coords)
+                .unwrap()
+        };
+        let off = (pixel(&seen.motion.now_from_last) - pixel(&truth)).norm();
+        let before = (pixel(&odometry.now_from_last) - pixel(&truth)).norm();
+        assert!(off < 0.5 && before > 15.0, "{off} px, odometry {before} px");
+    }
+    let rest = seen.motion.now_from_last * truth.inverse();
+    let sigma = |k: usize| seen.motion.covariance[(k, k)].sqrt();
+    for (k, x) in rest.translation.vector.iter().enumerate() {
+        assert!(x.abs() < 4.0 * sigma(k), "{x} m, {} m", sigma(k));
+    }
+    for (k, x) in rest.rotation.scaled_axis().iter().enumerate() {
+        assert!(
+            x.abs() < 4.0 * sigma(k + 3),
+            "{x} rad, {} rad",
+            sigma(k + 3)
+        );
+    }
+}
+
+#[test]
+fn a_picture_of_other_ground_tells_no_motion() {
+    let ([last, now], marks, odometry, _) = two_stops(Isometry3::identity(), [1, 2]);
+    let rules = EgomotionRules::default();
+    let refused = egomotion([&last, &now], &marks, &odometry, |_, _| true, &rules).unwrap_err();
+    assert!(refused.shown_n > 20 && refused.agreeing_n < refused.least_n.max(refused.found_n / 2));
+    let hidden = egomotion([&last, &now], &marks, &odometry, |_, _| false, &rules).unwrap_err();
+    assert_eq!(hidden.shown_n, 0);
 }

@@ -39,13 +39,14 @@ pub enum PointFault {
         /// Least contrast, DN.
         needed_dn: f64,
     },
-    /// Its contrast differs from that of the other points: a shadow or a reflection covers it.
-    #[error("its contrast is {found_dn:.1} DN where the plate's is {plate_dn:.1} DN")]
+    /// Its contrast is another part of its white than at the other points, whatever the light: a
+    /// reflection covers it, or it is no mark.
+    #[error("its contrast is {found:.2} of its white where the plate's is {plate:.2}")]
     OtherContrast {
-        /// White minus black at this point, DN.
-        found_dn: f64,
-        /// Median over the plate, DN.
-        plate_dn: f64,
+        /// White minus black over white at this point.
+        found: f64,
+        /// Median over the plate.
+        plate: f64,
     },
     /// The image does not look like the point: shadow edge, reflection, occlusion.
     #[error("its image differs from the model by {rms_dn:.1} DN rms, limit {limit_dn:.1} DN")]
@@ -86,7 +87,8 @@ pub enum PointFault {
 pub(super) struct MarkFit {
     pub pixel_px: Vector2<f64>,
     pub sigma_px: f64,
-    pub contrast_dn: f64,
+    /// White minus black over white: what light and shade leave as it is.
+    pub contrast: f64,
     pub blur_px: f64,
 }
 
@@ -255,7 +257,7 @@ pub(super) fn fit(
     Ok(MarkFit {
         pixel_px: centre,
         sigma_px: step.sigma_px.hypot(rules.sigma_floor_px),
-        contrast_dn: step.contrast_dn,
+        contrast: step.contrast_dn / step.white_dn.max(1.0),
         blur_px: blur,
     })
 }
@@ -264,6 +266,7 @@ struct Step {
     shift: Vector2<f64>,
     blur_shift: f64,
     contrast_dn: f64,
+    white_dn: f64,
     rms_dn: f64,
     sigma_px: f64,
     saturated: f64,
@@ -353,6 +356,7 @@ fn gauss_newton_step(
             shift: Vector2::zeros(),
             blur_shift: 0.0,
             contrast_dn: 0.0,
+            white_dn: 0.0,
             rms_dn: 0.0,
             sigma_px: 0.0,
             saturated: 0.0,
@@ -383,6 +387,7 @@ fn gauss_newton_step(
         shift: Vector2::new(x[0], x[1]) / gain,
         blur_shift: if free_blur { x[4] / gain } else { 0.0 },
         contrast_dn: -gain,
+        white_dn: x[3],
         rms_dn,
         sigma_px,
         saturated: f64::from(saturated) / f64::from(counted.max(1)),

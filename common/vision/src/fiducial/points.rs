@@ -74,22 +74,24 @@ fn too_few(rules: &DetectionRules, fits: &Fits) -> NotFound {
     }
 }
 
-/// Removes points whose contrast does not belong to the plate's.
+/// Removes points whose contrast does not belong to the plate's. Compared with its white a mark's
+/// contrast is the same in sun and shade, so that the arm's own shadow costs no more than the marks
+/// on its edge.
 fn check_contrast(fits: &mut Fits, rules: &DetectionRules) {
     let mut contrasts: Vec<f64> = fits
         .iter()
-        .filter_map(|(_, f)| f.as_ref().ok().map(|f| f.contrast_dn))
+        .filter_map(|(_, f)| f.as_ref().ok().map(|f| f.contrast))
         .collect();
-    let Some(plate_dn) = median(&mut contrasts) else {
+    let Some(plate) = median(&mut contrasts) else {
         return;
     };
     for (_, fit) in fits.iter_mut() {
         if let Ok(good) = fit
-            && (good.contrast_dn - plate_dn).abs() > rules.max_contrast_change * plate_dn
+            && (good.contrast - plate).abs() > rules.max_contrast_change * plate
         {
             *fit = Err(PointFault::OtherContrast {
-                found_dn: good.contrast_dn,
-                plate_dn,
+                found: good.contrast,
+                plate,
             });
         }
     }

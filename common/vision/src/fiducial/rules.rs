@@ -27,8 +27,8 @@ pub struct DetectionRules {
     pub min_points: usize,
     /// Least difference between white and black around a point, DN.
     pub min_contrast_dn: f64,
-    /// Largest difference of a point's contrast from the median of the plate's points, as a
-    /// fraction of that median.
+    /// Largest difference of a point's contrast, as a part of its white, from the median of the
+    /// plate's points, as a fraction of that median.
     pub max_contrast_change: f64,
     /// Largest rms difference between a point's image and its model, as a fraction of contrast;
     /// `noise_dn` is granted on top. Shadow edges, reflections and occlusions exceed it.

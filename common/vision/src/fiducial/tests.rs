@@ -333,9 +333,11 @@ fn a_shadow_edge_or_an_occluder_costs_points_but_not_accuracy() {
                     found.points.len()
                 );
                 assert!(rms(&errors) < 0.05 && worst < 0.25, "case {case}: {worst}");
-                assert!(!found.refused.is_empty(), "case {case}");
+                // only the marks on a shadow's edge are lost
+                let least = if case % 2 == 0 { 7 } else { 6 };
+                assert!(found.points.len() >= least, "case {case}: {:?}", found.refused);
             }
-            Err(e) => println!("case {case}: {e}"),
+            Err(e) => assert!(case % 2 == 1, "case {case}: {e}"),
         }
     }
 }

@@ -116,7 +116,11 @@ fn fitted(
     let across = place(neighbour_px, 0.0)? - origin;
     let down = place(0.0, neighbour_px)? - origin;
     let unit = down.cross(&across).try_normalize(1e-12)?;
-    Some(if unit.dot(&(eye - origin)) < 0.0 { -unit } else { unit })
+    Some(if unit.dot(&(eye - origin)) < 0.0 {
+        -unit
+    } else {
+        unit
+    })
 }
 
 #[cfg(test)]
@@ -141,8 +145,10 @@ mod tests {
         let through = Vector3::new(4.0, 0.3, 0.1);
         let landmarks: Vec<Landmark> = (0..25)
             .map(|k| {
-                let pixel_px =
-                    Vector2::new(170.0 + f64::from(k % 5) * 15.0, 240.0 + f64::from(k / 5) * 12.0);
+                let pixel_px = Vector2::new(
+                    170.0 + f64::from(k % 5) * 15.0,
+                    240.0 + f64::from(k / 5) * 12.0,
+                );
                 let ray = camera.ray(&pixel_px).unwrap();
                 let range = normal.dot(&(through - ray.origin)) / normal.dot(&ray.direction);
                 Landmark {

@@ -57,6 +57,10 @@ impl Session<'_> {
         let step_m = (rules.step_fraction * range_m).max(0.15);
         let seen = self.missed_n == 0;
         let here = self.served_from_here(&spot, &BaseRules::at_the_limit())?;
+        let found = here
+            .as_ref()
+            .map_or_else(String::clone, |s| format!("score {:.2}", s.arm_score));
+        tracing::debug!(aim = ?self.aim.map(|aim| self.in_level(&aim)), here = found, "near");
         if let Some(aim) = self.aim.take() {
             let pose = self.in_level(&aim);
             let is_there = Vector2::new(pose.x_m, pose.y_m).norm() <= ARRIVED.0
@@ -106,6 +110,12 @@ impl Session<'_> {
         if let Some((pose, way)) = way
             && self.near_moves_n < LAST_MOVE_N
         {
+            tracing::debug!(
+                ?pose,
+                best_arm,
+                n = choice.serving.len(),
+                "base pose chosen"
+            );
             self.aim = Some(self.in_site(&pose));
             return Ok(NearStep::Move(arcs(&way)));
         }
@@ -127,8 +137,9 @@ impl Session<'_> {
         let what = nearest.map_or_else(String::new, |(away_m, hazard)| {
             format!("; on the way to the best one, {away_m:.2} m away: {hazard}")
         });
-        let message =
-            format!("no way is clear to any of {n} base poses{what}; where the rover stands: {reason}");
+        let message = format!(
+            "no way is clear to any of {n} base poses{what}; where the rover stands: {reason}"
+        );
         Err(fault("path_blocked", message).with("range_m", range_m))
     }
 
