@@ -161,6 +161,20 @@ impl GroundMap {
         Self { rules, cells }
     }
 
+    /// Without what lies beside a rover that stands at the map's origin, no nearer than its sides: it
+    /// came there without meeting it, and goes on or back along it as well.
+    #[must_use]
+    pub fn passed(mut self, mobility: &MobilityDescription) -> Self {
+        let edge = self.rules.cell_m;
+        let [half_x, half_y] = mobility.footprint_half_m;
+        let widest = half_y + self.rules.side_margin_m + edge;
+        self.cells.retain(|&[i, j], _| {
+            let [x, y] = [i, j].map(|k| ((k as f64 + 0.5) * edge).abs());
+            !(x <= half_x && (half_y - 0.5 * edge..=widest).contains(&y))
+        });
+        self
+    }
+
     /// Known cells.
     #[must_use]
     pub fn cells_n(&self) -> usize {
@@ -362,6 +376,28 @@ pub(crate) mod tests {
             y_m,
             heading_rad,
         }
+    }
+
+    #[test]
+    fn what_the_rover_stands_beside_does_not_keep_it_there() {
+        let mobility = mobility();
+        let beside = |x: f64, y: f64| {
+            let near = (0.1..0.4).contains(&x) && (0.42..0.60).contains(&y);
+            if near { 0.3 } else { 0.0 }
+        };
+        let behind = PlanarPose {
+            x_m: -0.3,
+            y_m: 0.0,
+            heading_rad: 0.0,
+        };
+        let map = ground(beside);
+        assert!(map.standing(&behind, &mobility, 0.3).is_err());
+        let map = map.passed(&mobility);
+        assert!(map.standing(&behind, &mobility, 0.3).is_ok());
+        let ahead = ground(|x, _| if (0.62..0.8).contains(&x) { 0.3 } else { 0.0 });
+        let forwards = PlanarPose { x_m: 0.3, ..behind };
+        let standing = ahead.passed(&mobility).standing(&forwards, &mobility, 0.3);
+        assert!(standing.is_err());
     }
 
     #[test]

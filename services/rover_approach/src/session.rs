@@ -5,7 +5,7 @@ mod ground;
 mod near;
 
 use crate::anchor::TrackRules;
-use crate::drive::{DriveRules, next_movement};
+use crate::drive::{DriveRules, next_movement, straight};
 use crate::egomotion::{Egomotion, EgomotionRules, Landmark, egomotion};
 use crate::filter::{Motion, TargetEstimate};
 use crate::fix::{Fix, Refusal};
@@ -26,7 +26,7 @@ use rover_messages::{
         ApproachActivity, ApproachStop, DriveToFeedback, DriveToGoal, DriveToResult, SeenMotion,
         Sighting,
     },
-    mobility::{DriveArc, DriveResult, WheelsState},
+    mobility::{DriveArc, DriveResult, DriveStop, WheelsState},
     status::work,
 };
 use rover_robot::{MastDescription, MobilityDescription, Robot};
@@ -42,6 +42,10 @@ const HIDING_M: f64 = 0.01;
 const MAX_STOPS_N: u32 = 60;
 /// Movements back from where no way is clear, in one approach.
 const RETREATS_N: u32 = 3;
+/// Way back from where no way is clear or a wheel stalled, m.
+const RETREAT_M: f64 = 0.4;
+/// Times that a wheel may stall in one approach.
+const STALLS_N: u32 = 3;
 /// What the prediction of a pixel may be off besides, px.
 const UNKNOWN_PX: f64 = 1.0;
 /// Stops in a row at which the target may be missed.
@@ -75,6 +79,9 @@ pub(crate) struct Session<'a> {
     near_moves_n: u32,
     /// Movements back from where no way was clear.
     retreats_n: u32,
+    /// Movements that ended because a wheel stalled, and whether the last one did.
+    stalls_n: u32,
+    stuck: bool,
     shade: Arc<Shade>,
     /// Stops in a row at which the target was not found.
     missed_n: u32,
@@ -149,6 +156,8 @@ impl<'a> Session<'a> {
             spot_offset_m: None,
             near_moves_n: 0,
             retreats_n: 0,
+            stalls_n: 0,
+            stuck: false,
             shade,
             missed_n: 0,
             aim: None,
@@ -166,7 +175,10 @@ impl<'a> Session<'a> {
             let range_m = self.estimate.position_m.xy().norm();
             self.tell(ApproachActivity::Planning);
             self.look_ahead().await?;
-            let arcs = if range_m > NEAR_M {
+            let arcs = if std::mem::take(&mut self.stuck) {
+                self.aim = None;
+                vec![straight(-RETREAT_M).arc]
+            } else if range_m > NEAR_M {
                 let shell = self.hardware.shell;
                 vec![shell.timed(work::PLANNING, || self.far_movement(range_m))?]
             } else {
@@ -192,6 +204,9 @@ impl<'a> Session<'a> {
                 let done = self.hardware.drive(arc, self.goal.limits.max_slip).await?;
                 let next = self.driven(&done)?;
                 motion = Some(motion.map_or(next, |before| before.then(&next)));
+                if self.stuck {
+                    break;
+                }
             }
             if let Some(motion) = motion {
                 self.look(&motion, range_m <= NEAR_M).await?;
@@ -228,13 +243,19 @@ impl<'a> Session<'a> {
         self.driven_m += way;
         if let Some(stop) = &done.stop_reason {
             let name = match stop {
-                rover_messages::mobility::DriveStop::Slip { .. } => "slip",
-                rover_messages::mobility::DriveStop::Tilt { .. } => "tilt",
+                DriveStop::Slip { .. } => "slip",
+                DriveStop::Tilt { .. } => "tilt",
+                DriveStop::Stalled { .. } => "stalled",
                 _ => "drive_stopped",
             };
-            return Err(
-                fault(name, format!("the drive ended early: {stop}")).with("slip", done.state.slip)
-            );
+            let again = matches!(stop, DriveStop::Stalled { .. }) && self.stalls_n < STALLS_N;
+            if again {
+                self.stalls_n += 1;
+                self.stuck = true;
+            } else {
+                return Err(fault(name, format!("the drive ended early: {stop}"))
+                    .with("slip", done.state.slip));
+            }
         }
         if let Some(limit) = self.goal.limits.max_distance_m
             && self.driven_m > limit

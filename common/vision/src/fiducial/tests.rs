@@ -335,7 +335,11 @@ fn a_shadow_edge_or_an_occluder_costs_points_but_not_accuracy() {
                 assert!(rms(&errors) < 0.05 && worst < 0.25, "case {case}: {worst}");
                 // only the marks on a shadow's edge are lost
                 let least = if case % 2 == 0 { 7 } else { 6 };
-                assert!(found.points.len() >= least, "case {case}: {:?}", found.refused);
+                assert!(
+                    found.points.len() >= least,
+                    "case {case}: {:?}",
+                    found.refused
+                );
             }
             Err(e) => assert!(case % 2 == 1, "case {case}: {e}"),
         }

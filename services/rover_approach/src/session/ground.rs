@@ -87,6 +87,6 @@ impl Session<'_> {
             .flatten()
             .map(|p| (level_from_site * Point3::from(*p)).coords)
             .collect();
-        GroundMap::from_points(&points, GroundRules::default())
+        GroundMap::from_points(&points, GroundRules::default()).passed(self.mobility)
     }
 }

@@ -1,6 +1,6 @@
 //! The last metres: which base pose to take, and the movement towards it.
 
-use super::{RETREATS_N, Session};
+use super::{RETREAT_M, RETREATS_N, Session};
 use crate::base_pose::{BaseChoice, BaseRules, BaseTask, Serving, TargetSpot};
 use crate::drive::{Movement, hazard_on_the_way, next_movement, straight, towards_pose};
 use crate::hardware::fault;
@@ -17,8 +17,6 @@ use std::sync::Arc;
 
 /// Base poses to which a way around is looked for.
 const AROUND_N: usize = 20;
-/// Way back from where no other way is clear, m.
-const RETREAT_M: f64 = 0.4;
 /// A pose in which the arm works worse than in the best by no more than this is not left.
 const GOOD_ENOUGH: f64 = 0.15;
 /// Close enough to the chosen base pose: m, rad.
