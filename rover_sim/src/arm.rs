@@ -115,16 +115,7 @@ impl ArmPhysics {
         let mut world = rp::PhysicsWorld::new();
         world.gravity = vector(&model.gravity_m_s2);
         set_parameters(&mut world.integration_parameters, model);
-        let statics = surfaces
-            .iter()
-            .map(|s| {
-                if s.triangles.is_empty() {
-                    return Ok(None);
-                }
-                let collider = surface_collider(s, model)?;
-                Ok(Some(world.insert_collider(collider, None)))
-            })
-            .collect::<Result<_, SimulationError>>()?;
+        let statics = insert_surfaces(&mut world, model, surfaces)?;
         for capsule in &model.body {
             let groups = groups(BODY, LINKS | PLUNGER);
             world.insert_collider(capsule_collider(capsule, groups, model), None);
@@ -333,6 +324,19 @@ impl ArmPhysics {
         Contacts { tip, elsewhere }
     }
 
+    /// Puts the surfaces into a world that has none yet.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn surround(
+        &mut self,
+        model: &ArmModel,
+        surfaces: &[StaticSurface<'_>],
+    ) -> Result<(), SimulationError> {
+        self.statics = insert_surfaces(&mut self.world, model, surfaces)?;
+        Ok(())
+    }
+
     /// Takes a surface (its index in the order given to [`Self::new`]) out of the world. Returns
     /// whether it was there.
     pub fn remove_surface(&mut self, index: usize) -> bool {
@@ -381,6 +385,24 @@ fn capsule_collider(
         .density(0.0)
         .friction(model.contact.friction)
         .collision_groups(groups)
+}
+
+/// The colliders of surfaces in their order; none for one without triangles.
+fn insert_surfaces(
+    world: &mut rp::PhysicsWorld,
+    model: &ArmModel,
+    surfaces: &[StaticSurface<'_>],
+) -> Result<Vec<Option<rp::ColliderHandle>>, SimulationError> {
+    surfaces
+        .iter()
+        .map(|s| {
+            if s.triangles.is_empty() {
+                return Ok(None);
+            }
+            let collider = surface_collider(s, model)?;
+            Ok(Some(world.insert_collider(collider, None)))
+        })
+        .collect()
 }
 
 fn surface_collider(

@@ -86,6 +86,8 @@ pub struct World {
     description: SimulationDescription,
     terrain: Arc<Terrain>,
     arm: ArmPhysics,
+    /// Whether the arm's world holds the terrain that it can reach.
+    surrounded: bool,
     driver: Driver,
     switch: Switch,
     eyes: Arc<Mutex<Eyes>>,
@@ -139,7 +141,7 @@ impl World {
             .mast
             .map(|mast| Mast::new(mast, scale, seed, description.step_s));
         let drooped = statics::drooped_angles_rad(&model, start_rad)?;
-        let mut arm = build::arm_physics(&model, &terrain, &[], &drooped)?;
+        let mut arm = build::arm_physics(&model, &terrain, &drooped)?;
         arm.set_rest(start_rad);
         let driver = Driver::new(
             model.arm.limits(),
@@ -165,6 +167,7 @@ impl World {
             description: description.clone(),
             terrain,
             arm,
+            surrounded: true,
             driver,
             switch,
             eyes: Arc::new(Mutex::new(eyes)),

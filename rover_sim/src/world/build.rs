@@ -92,13 +92,25 @@ pub(super) fn stand(
     Ok(())
 }
 
-/// The arm in its world: all of the terrain round a fixed mount, what is within reach of a rover.
+/// The arm's world with what it can reach.
 pub(super) fn arm_physics(
     model: &ArmModel,
     terrain: &Terrain,
-    gone: &[usize],
     q0_rad: &[f64],
 ) -> Result<ArmPhysics, SimulationError> {
+    let mut arm = ArmPhysics::new(model, &[], q0_rad)?;
+    surround(&mut arm, model, terrain, &[])?;
+    Ok(arm)
+}
+
+/// Puts what the arm can reach into its world, but for the bodies that are gone: all the terrain,
+/// or around a rover that stands the part before it.
+pub(super) fn surround(
+    arm: &mut ArmPhysics,
+    model: &ArmModel,
+    terrain: &Terrain,
+    gone: &[usize],
+) -> Result<(), SimulationError> {
     let bodies = terrain.bodies.iter().enumerate();
     let Some(standing) = &model.standing else {
         let surfaces: Vec<_> = bodies
@@ -108,7 +120,7 @@ pub(super) fn arm_physics(
                 triangles: &body.mesh.triangles,
             })
             .collect();
-        return ArmPhysics::new(model, &surfaces, q0_rad);
+        return arm.surround(model, &surfaces);
     };
     let centre = standing.world_from_rover * Point3::new(REACH_X_M, 0.0, 0.0);
     let near: Vec<_> = bodies
@@ -129,7 +141,7 @@ pub(super) fn arm_physics(
             triangles,
         })
         .collect();
-    ArmPhysics::new(model, &surfaces, q0_rad)
+    arm.surround(model, &surfaces)
 }
 
 /// The true arm for rapier.

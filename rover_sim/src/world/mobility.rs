@@ -157,8 +157,8 @@ impl World {
         Some(Err(Fault::new(HARDWARE, name, message)))
     }
 
-    /// From the wheels to the springs: the arm's world is made anew where the rover stands, and
-    /// the arm settles. No simulated time passes.
+    /// From the wheels to the springs: the arm's world is made anew where the rover stands, without
+    /// the terrain until the arm moves, and the arm settles. No simulated time passes.
     fn park(&mut self) -> Result<(), SimulationError> {
         let Some(vehicle) = &self.vehicle else {
             return Ok(());
@@ -167,7 +167,8 @@ impl World {
         let rest = self.driver.rest_rad.clone();
         build::stand(&mut self.model, &self.robot, &self.truth, &pose, &rest)?;
         let drooped = statics::drooped_angles_rad(&self.model, &rest)?;
-        self.arm = build::arm_physics(&self.model, &self.terrain, &self.gone, &drooped)?;
+        self.arm = crate::ArmPhysics::new(&self.model, &[], &drooped)?;
+        self.surrounded = false;
         self.arm.set_rest(&rest);
         let limit = (self.description.driver.settle_limit_s / self.description.step_s) as u64;
         let mut calm = 0;

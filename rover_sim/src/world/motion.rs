@@ -1,6 +1,6 @@
 //! Motions: how they begin, are stopped, watched and ended.
 
-use super::{REST_STEPS, World};
+use super::{REST_STEPS, World, build};
 use crate::{description::Moment, driver::Phase};
 use rover_kinematics::JointTrajectory;
 use rover_messages::{
@@ -40,6 +40,11 @@ impl World {
         }
         if let Err(e) = trajectory.validate(&self.robot.arm) {
             return refuse("trajectory_invalid", e.to_string());
+        }
+        if !self.surrounded {
+            build::surround(&mut self.arm, &self.model, &self.terrain, &self.gone)
+                .map_err(|e| Fault::new(HARDWARE, "internal_error", e.to_string()))?;
+            self.surrounded = true;
         }
         let (Some(first), Some(last)) = (trajectory.points.first(), trajectory.points.last())
         else {

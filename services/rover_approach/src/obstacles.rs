@@ -175,6 +175,27 @@ impl GroundMap {
         self
     }
 
+    /// Whether there is hardly a place of a strip that is far from known ground: from `ahead_m[0]` to
+    /// `ahead_m[1]` before `pose`, and so far to either side.
+    #[must_use]
+    pub fn knows(&self, pose: &PlanarPose, ahead_m: [f64; 2], aside_m: f64) -> bool {
+        /// Distance between the places looked at, and from there to a known cell, m.
+        const STEP_M: f64 = 0.15;
+        /// Least part of the places that are known.
+        const LEAST: f64 = 0.95;
+        let count = |length: f64| (length / STEP_M).ceil().max(1.0) as i32;
+        let (along, across) = (count(ahead_m[1] - ahead_m[0]), count(aside_m));
+        let mut known = 0;
+        for i in 0..=along {
+            for j in -across..=across {
+                let x = ahead_m[0] + STEP_M * f64::from(i);
+                let place = pose.at(x, STEP_M * f64::from(j));
+                known += i32::from(self.mean_m(&place, STEP_M).is_some());
+            }
+        }
+        f64::from(known) >= LEAST * f64::from((along + 1) * (2 * across + 1))
+    }
+
     /// Known cells.
     #[must_use]
     pub fn cells_n(&self) -> usize {
@@ -376,6 +397,28 @@ pub(crate) mod tests {
             y_m,
             heading_rad,
         }
+    }
+
+    #[test]
+    fn a_strip_is_known_that_points_were_seen_all_over() {
+        let seen = |p: &&Vector3<f64>| p.x > 0.4 && p.x < 2.0;
+        let points: Vec<Vector3<f64>> = (0..40)
+            .flat_map(|i| (0..40).map(move |j| (f64::from(i), f64::from(j))))
+            .map(|(i, j)| Vector3::new(0.1 * i, 0.1 * j - 2.0, 0.0))
+            .collect();
+        let map = GroundMap::from_points(points.iter().filter(seen), GroundRules::default());
+        let here = PlanarPose {
+            x_m: 0.0,
+            y_m: 0.0,
+            heading_rad: 0.2,
+        };
+        assert!(map.knows(&here, [0.6, 1.7], 0.5));
+        assert!(!map.knows(&here, [0.6, 3.0], 0.5));
+        let away = PlanarPose {
+            heading_rad: 2.5,
+            ..here
+        };
+        assert!(!map.knows(&away, [0.6, 1.7], 0.5));
     }
 
     #[test]

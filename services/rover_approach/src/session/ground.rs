@@ -3,7 +3,7 @@
 use super::Session;
 use crate::egomotion::Landmark;
 use crate::hardware::Frame;
-use crate::obstacles::{GroundMap, GroundRules};
+use crate::obstacles::{GroundMap, GroundRules, PlanarPose};
 use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 use rover_messages::{Fault, approach::ApproachActivity, status::work};
 use rover_vision::{MatchRules, sparse_points};
@@ -11,7 +11,7 @@ use rover_vision::{MatchRules, sparse_points};
 /// Where the ground is looked at before each movement, m ahead.
 const HAZARD_LOOK_M: f64 = 2.0;
 /// Pixels between the points of the ground map.
-const MAP_STEP_PX: u32 = 20;
+const MAP_STEP_PX: u32 = 28;
 /// What the mast sees so near to the rover is the rover itself, m.
 const OWN_M: f64 = 0.08;
 /// Frames whose points are kept.
@@ -19,12 +19,22 @@ const MAP_FRAMES: usize = 6;
 
 impl Session<'_> {
     /// Looks at the ground that the next movement leads over, unless the target's own image shows
-    /// it.
+    /// it or it is known already.
     pub(super) async fn look_ahead(&mut self) -> Result<(), Fault> {
         self.tell(ApproachActivity::Looking);
         let bearing = self.estimate.position_m.xy().normalize();
         let range_m = self.estimate.position_m.xy().norm();
-        if range_m < HAZARD_LOOK_M {
+        let [half_x, half_y] = self.mobility.footprint_half_m;
+        let level = self.level_from_rover();
+        let towards = level * self.estimate.position_m;
+        let ahead = PlanarPose {
+            x_m: 0.0,
+            y_m: 0.0,
+            heading_rad: towards.y.atan2(towards.x),
+        };
+        let far_m = half_x + half_x + self.rules.max_step_m;
+        let known = || self.map().knows(&ahead, [half_x, far_m], half_y);
+        if range_m < HAZARD_LOOK_M || known() {
             return Ok(());
         }
         let place = bearing * HAZARD_LOOK_M;
