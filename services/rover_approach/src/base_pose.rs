@@ -6,10 +6,13 @@
 //! freely the tip moves, how far the joints are from their limits, and how much lies between the
 //! wheels and the limits of the ground.
 
+mod room;
+
 use crate::drive::aim_of;
 use crate::obstacles::{GroundMap, PlanarPose, Standing};
 use crate::shade::Shade;
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector2, Vector3};
+use room::room_m;
 use rover_cameras::StereoPair;
 use rover_kinematics::{AxisGoal, solve_axis};
 use rover_robot::{CameraMount, CameraPairDescription, MobilityDescription, Robot};
@@ -47,6 +50,8 @@ pub struct BaseRules {
     /// Distance that the arm keeps from the target's tangent plane and from the ground where it can,
     /// m: what its planner may ask for.
     pub terrain_margin_m: f64,
+    /// Least distance of the arm from there, m.
+    pub min_room_m: f64,
     /// Poses that differ by less (m and rad) are the same one.
     pub apart: [f64; 2],
 }
@@ -67,7 +72,8 @@ impl Default for BaseRules {
             max_slope_rad: 0.26,
             shade_margin_m: 0.06,
             view_margin_m: 0.06,
-            terrain_margin_m: 0.04,
+            terrain_margin_m: 0.06,
+            min_room_m: 0.035,
             apart: [0.20, 0.30],
         }
     }
@@ -81,6 +87,7 @@ impl BaseRules {
         Self {
             plate_border_px: 8.0,
             max_facing_rad: 1.13,
+            min_room_m: 0.02,
             ..Self::default()
         }
     }
@@ -158,12 +165,28 @@ pub struct BaseTask<'a> {
 }
 
 /// The target in some rover frame.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct TargetSpot {
     /// Position, m.
     pub position_m: Vector3<f64>,
     /// Outward unit normal.
     pub normal: Vector3<f64>,
+    /// Places of the surface about it that stereo has measured, m; the tangent plane speaks for it
+    /// besides.
+    pub around_m: Vec<Vector3<f64>>,
+}
+
+impl TargetSpot {
+    /// The same in another frame.
+    #[must_use]
+    pub fn moved(&self, to_from: &Isometry3<f64>) -> Self {
+        let place = |p: &Vector3<f64>| (to_from * Point3::from(*p)).coords;
+        Self {
+            position_m: place(&self.position_m),
+            normal: to_from.rotation * self.normal,
+            around_m: self.around_m.iter().map(place).collect(),
+        }
+    }
 }
 
 impl BaseTask<'_> {
@@ -240,10 +263,7 @@ impl BaseTask<'_> {
             .map_err(|hazard| hazard.name().to_string())?;
         let here_from_there = placed(pose, &standing);
         let there = here_from_there.inverse();
-        let spot = TargetSpot {
-            position_m: (there * Point3::from(target.position_m)).coords,
-            normal: there.rotation * target.normal,
-        };
+        let spot = target.moved(&there);
         if self.shades(&spot, &there.rotation) {
             return Err("own_shadow".into());
         }
@@ -331,9 +351,9 @@ impl BaseTask<'_> {
             let facing_rad = facing.into_iter().fold(0.0, f64::max);
             let postures = before.iter().copied().chain([touch]);
             let room_m = postures
-                .filter_map(|s| self.room_m(spot, &s.joints_rad))
+                .filter_map(|s| room_m(robot, spot, &s.joints_rad))
                 .fold(r.terrain_margin_m, f64::min);
-            if room_m < 0.0 {
+            if room_m < r.min_room_m {
                 reason = "arm_in_the_terrain";
                 continue;
             }
@@ -360,51 +380,6 @@ impl BaseTask<'_> {
             }
         }
         best.ok_or_else(|| reason.to_string())
-    }
-
-    /// Distance of the arm from the tangent plane at the target, near the target, and from the
-    /// ground on which the rover stands, m; `spot` in the rover's frame. Of the last link the tool
-    /// is left out, which is to go there, and the rest may come nearer, which counts as more. None
-    /// for joint angles that are none of this arm.
-    fn room_m(&self, spot: &TargetSpot, joints_rad: &[f64]) -> Option<f64> {
-        /// Farther aside the surface is another one, m.
-        const NEAR_M: f64 = 0.25;
-        /// Places looked at on each shape.
-        const PLACES: u32 = 5;
-        /// Part of the last link about its tip that may touch, m.
-        const TOOL_M: f64 = 0.12;
-        /// How much nearer the rest of the last link may come.
-        const NEARER: f64 = 3.0;
-        let robot = self.robot;
-        let frames = robot.arm.link_poses(joints_rad).ok()?;
-        let joints = &robot.description().arm.joints;
-        let mut room_m = f64::INFINITY;
-        let (tip, _) = robot.tool.at(&robot.arm, joints_rad).ok()?;
-        let tip = (robot.rover_from_arm_base.isometry * Point3::from(tip)).coords;
-        let links = frames.iter().skip(1).zip(joints).enumerate();
-        for (link, (frame, joint)) in links.skip(1) {
-            let is_last = link + 1 == joints.len();
-            let rover_from_link = robot.rover_from_arm_base.isometry * frame;
-            for shape in &joint.shape {
-                let [a, b] = [shape.from_m, shape.to_m].map(Vector3::from);
-                for k in 0..PLACES {
-                    let part = f64::from(k) / f64::from(PLACES - 1);
-                    let place = (rover_from_link * Point3::from(a + (b - a) * part)).coords;
-                    let away = place - spot.position_m;
-                    let above_m = away.dot(&spot.normal);
-                    if is_last && (place - tip).norm() < TOOL_M {
-                        continue;
-                    }
-                    let mut least_m = place.z;
-                    if (away - spot.normal * above_m).norm() < NEAR_M {
-                        least_m = least_m.min(above_m);
-                    }
-                    let weight = if is_last { NEARER } else { 1.0 };
-                    room_m = room_m.min((least_m - shape.radius_m) * weight);
-                }
-            }
-        }
-        Some(room_m)
     }
 
     /// Whether a pose is one of those not to be chosen again, or all but the same.

@@ -50,8 +50,9 @@ const STALLS_N: u32 = 3;
 const UNKNOWN_PX: f64 = 1.0;
 /// Stops in a row at which the target may be missed.
 const MISSES_N: u32 = 1;
-/// The same while the rover's own body or the edge of its shadow passes over it.
-const SHADED_MISSES_N: u32 = 5;
+/// The same while the rover's own body or the edge of its shadow passes over it, or landmarks tell
+/// the way.
+const LONG_MISSES_N: u32 = 5;
 /// Largest uncertainty with which a missed target is carried on by odometry, mm, one sigma.
 const MISSED_SIGMA_MM: f64 = 120.0;
 
@@ -388,8 +389,9 @@ impl<'a> Session<'a> {
         let worst_mm = sigma_mm(&self.estimate.covariance_m2)
             .iter()
             .fold(0.0_f64, |m, s| m.max(*s));
-        let most_n = if refusal.by_the_rover() {
-            SHADED_MISSES_N
+        // Where landmarks tell the way, it is known as well as the target was.
+        let most_n = if refusal.by_the_rover() || seen.is_some() {
+            LONG_MISSES_N
         } else {
             MISSES_N
         };

@@ -68,7 +68,7 @@ impl Shade {
 }
 
 /// Distance between a point and a segment, m.
-fn point_to_segment(point: &Vector3<f64>, a: &Vector3<f64>, b: &Vector3<f64>) -> f64 {
+pub(crate) fn point_to_segment(point: &Vector3<f64>, a: &Vector3<f64>, b: &Vector3<f64>) -> f64 {
     let ab = b - a;
     let s = (point - a).dot(&ab) / ab.norm_squared().max(1e-12);
     (point - a - ab * s.clamp(0.0, 1.0)).norm()

@@ -30,6 +30,7 @@ fn choose_another(
     let spot = TargetSpot {
         position_m: target.into(),
         normal: Vector3::from(normal).normalize(),
+        around_m: Vec::new(),
     };
     let choice = task.choose(&spot, map);
     if let Ok(choice) = &choice {

@@ -64,6 +64,7 @@ impl Session<'_> {
         let spot = TargetSpot {
             position_m: target.position_m.coords,
             normal: target.normal.unit.into_inner(),
+            around_m: self.surface_about(&target.position_m.coords),
         };
         if let Err(reason) = self.served_from_here(&spot, &BaseRules::at_the_limit())? {
             return self.otherwise(&target, &reason);

@@ -7,7 +7,7 @@ use crate::hardware::fault;
 use crate::obstacles::{GroundMap, PlanarPose};
 use crate::service::unfit;
 use crate::surface::measure_plane;
-use nalgebra::{Point3, Vector2, Vector3};
+use nalgebra::{Vector2, Vector3};
 use rover_geometry::tangent_basis;
 use rover_messages::{
     Fault,
@@ -47,6 +47,7 @@ impl Session<'_> {
         let spot = TargetSpot {
             position_m: self.estimate.position_m,
             normal: self.seen_normal().unwrap_or(surface.plane.normal),
+            around_m: self.surface_about(&self.estimate.position_m),
         };
         let map = self.map();
         let range_m = self.estimate.position_m.xy().norm();
@@ -188,6 +189,7 @@ impl Session<'_> {
                 let spot = TargetSpot {
                     position_m: there.plane.point,
                     normal: there.plane.normal,
+                    around_m: self.surface_about(&there.plane.point),
                 };
                 let moved = there.plane.point - plane.point;
                 if moved.norm() > radius_m * 1.2 {
@@ -228,6 +230,14 @@ impl Session<'_> {
         })
     }
 
+    /// Places that the last picture shows about one, present rover frame.
+    pub(super) fn surface_about(&self, place_m: &Vector3<f64>) -> Vec<Vector3<f64>> {
+        /// The arm's last links reach no farther from the target, m.
+        const ABOUT_M: f64 = 0.30;
+        let points = self.landmarks.iter().map(|mark| mark.point_m);
+        points.filter(|p| (p - place_m).norm() < ABOUT_M).collect()
+    }
+
     /// The target's normal as the body cameras saw it, present rover frame.
     fn seen_normal(&self) -> Option<Vector3<f64>> {
         let rover_from_site = self.wheels.pose.site_from_rover().isometry.inverse();
@@ -266,11 +276,7 @@ impl Session<'_> {
     }
 
     fn levelled(&self, spot: &TargetSpot) -> TargetSpot {
-        let level = self.level_from_rover();
-        TargetSpot {
-            position_m: (level * Point3::from(spot.position_m)).coords,
-            normal: level.rotation * spot.normal,
-        }
+        spot.moved(&self.level_from_rover())
     }
 
     /// Where the rover stands, site frame.
