@@ -11,6 +11,7 @@ use rover_messages::{
         DriveFeedback, DriveGoal, DriveResult, MastState, PointFeedback, PointGoal, PointResult,
         WheelsState,
     },
+    panorama::{Panorama, PanoramaRequest},
     placement::{
         ContactFeedback, ContactGoal, ContactResult, PlaceFeedback, PlaceGoal, PlaceResult,
     },
@@ -77,6 +78,8 @@ impl Default for Registry {
             message::<Fault>(),
             message::<ArmState>(),
             message::<CaptureRequest>(),
+            message::<PanoramaRequest>(),
+            message::<Panorama>(),
             message::<RawPair>(),
             message::<StereoFrame>(),
             message::<Plan>(),

@@ -24,7 +24,7 @@ pub struct ImageData {
 }
 
 impl ImageData {
-    fn check(&self, field: &str) -> Result<(), String> {
+    pub(crate) fn check(&self, field: &str) -> Result<(), String> {
         let expected = u64::from(self.width_px) * u64::from(self.height_px);
         if expected == self.pixels.len() as u64 {
             return Ok(());

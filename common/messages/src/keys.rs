@@ -60,6 +60,10 @@ pub fn imaging_capture(pair: &str) -> String {
 pub fn imaging_recall(pair: &str) -> String {
     format!("imaging/{pair}/recall")
 }
+/// Pictures all round as one mosaic, query ([`crate::panorama::PanoramaRequest`]); the mast moves.
+pub fn imaging_panorama(pair: &str) -> String {
+    format!("imaging/{pair}/panorama")
+}
 /// Last left or right image of `pair` as a picture, stream.
 pub fn imaging_picture(pair: &str, side: &str) -> String {
     format!("imaging/{pair}/{side}")

@@ -12,6 +12,7 @@ pub mod codec;
 pub mod imaging;
 pub mod keys;
 pub mod mobility;
+pub mod panorama;
 pub mod placement;
 pub mod planning;
 pub mod simulation;

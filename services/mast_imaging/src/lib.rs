@@ -4,6 +4,7 @@
 //! [`attach_models`] is the pure part; [`serve`] puts it on the network.
 
 mod frame;
+pub mod panorama;
 mod service;
 
 pub use frame::attach_models;

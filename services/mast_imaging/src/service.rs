@@ -1,14 +1,18 @@
 //! The imaging service on the network: `imaging/<pair>/capture`, `.../left` and `.../right` for
-//! every camera pair of the robot, and `.../recall` for the last frames again.
+//! every camera pair of the robot, and `.../recall` for the last frames again; `.../panorama` and
+//! its picture `.../mosaic` for pairs on the mast.
 
-use crate::{SERVICE, attach_models};
+use crate::{SERVICE, attach_models, panorama};
 use rover_bus::{BusError, Peer, PictureStream};
 use rover_messages::{
     Fault,
     imaging::{CaptureRequest, FrameReference, ImageData, RawPair, StereoFrame},
     keys,
+    mobility::{PointFeedback, PointGoal, PointResult},
+    panorama::{Panorama, PanoramaRequest, PanoramaView},
+    status::work,
 };
-use rover_robot::{CameraPairDescription, Robot};
+use rover_robot::{CameraMount, CameraPairDescription, Robot};
 use rover_service::{Service, ServiceShell};
 use rover_vision::{Image8, encode_png};
 use std::{
@@ -40,10 +44,22 @@ pub async fn serve(peer: &Peer, robot: Arc<Robot>) -> Result<Service, BusError> 
             right: peer
                 .picture_stream(&keys::imaging_picture(&pair.name, "right"))
                 .await?,
+            mosaic: peer
+                .picture_stream(&keys::imaging_picture(&pair.name, "mosaic"))
+                .await?,
             robot: robot.clone(),
             pair: pair.clone(),
             kept: Mutex::default(),
         });
+        if pair.mount == CameraMount::Mast {
+            let desk = desk.clone();
+            let key = keys::imaging_panorama(&pair.name);
+            let panorama = peer.serve(&key, move |request: PanoramaRequest| {
+                let desk = desk.clone();
+                async move { desk.panorama(request).await }
+            });
+            served.push(panorama.await?);
+        }
         let recalling = desk.clone();
         let key = keys::imaging_recall(&pair.name);
         let recall = peer.serve(&key, move |reference: FrameReference| {
@@ -70,6 +86,7 @@ struct Desk {
     kept: Mutex<VecDeque<(u32, StereoFrame)>>,
     left: PictureStream,
     right: PictureStream,
+    mosaic: PictureStream,
 }
 
 impl Desk {
@@ -125,6 +142,67 @@ impl Desk {
         show(&self.left, &frame.images.left);
         show(&self.right, &frame.images.right);
         Ok(frame)
+    }
+}
+
+impl Desk {
+    async fn panorama(&self, request: PanoramaRequest) -> Result<Panorama, Fault> {
+        let _activity = self.shell.activity("looking round");
+        self.shell
+            .answered(self.looked_round(request).await, "panoramas")
+    }
+
+    async fn looked_round(&self, request: PanoramaRequest) -> Result<Panorama, Fault> {
+        let mast = self
+            .robot
+            .mast()
+            .map_err(|e| Fault::new(SERVICE, "no_mast", e.to_string()))?;
+        let stops = panorama::stops(&request, &self.pair.cameras.left, mast)?;
+        let (mut views, mut pictures) = (Vec::new(), Vec::new());
+        for [pan_rad, tilt_rad] in stops {
+            let state = self.point(PointGoal { pan_rad, tilt_rad }).await?.state;
+            let frame = self.captured(CaptureRequest::default()).await?;
+            let left = frame.cameras.left.clone();
+            pictures.push((left.clone(), frame.images.left));
+            views.push(PanoramaView {
+                frame: FrameReference {
+                    pair: self.pair.name.clone(),
+                    step: frame.images.step,
+                    exposure_n: 0,
+                },
+                mast: state,
+                left,
+            });
+        }
+        let made = self.shell.timed(work::VISION, || {
+            panorama::mosaic(&pictures, request.pixel_rad)
+        })?;
+        show(&self.mosaic, &made.image);
+        Ok(Panorama {
+            mosaic: made.image,
+            azimuth_rad: made.azimuth_rad,
+            elevation_rad: made.elevation_rad,
+            pixel_rad: made.pixel_rad,
+            eye_m: made.eye_m.into(),
+            views,
+        })
+    }
+
+    /// Points the mast; its heartbeats come from here.
+    async fn point(&self, goal: PointGoal) -> Result<PointResult, Fault> {
+        let command = self
+            .peer
+            .command::<_, PointFeedback, PointResult>(keys::MAST_POINT, &goal);
+        let mut running = command.await.map_err(|e| e.into_fault(SERVICE))?;
+        loop {
+            let report = running.beat().await.map_err(|e| e.into_fault(SERVICE))?;
+            if let Some(fault) = report.fault {
+                return Err(fault);
+            }
+            if let Some(result) = report.result {
+                return Ok(result);
+            }
+        }
     }
 }
 
