@@ -188,7 +188,7 @@ impl Truth {
     /// directions is that of the independent program. It does not state which directions these are
     /// and where the middle is; both were chosen so that the methods which use the poses agree
     /// with it: how the limited HIPS bears a lens that it does not know depends on what part of
-    /// the lens the poses show (5 to 11 mm).
+    /// the lens the poses show (4 to 14 mm).
     fn look_around(&mut self, draws: &mut Draws) {
         let mut near = self.first_joints();
         while self.initial.len() < INITIAL_POSES {

@@ -6,6 +6,8 @@ use std::fmt::Write;
 
 /// Medians that differ by less agree: the scatter of a median of 200 trials, twice.
 const AGREEMENT: f64 = 0.2;
+/// Cells outside that the verdict names.
+const NAMED: usize = 4;
 
 /// Whether a median is better than EPEC's by more than 2 %.
 pub fn is_better(median_mm: f64, epec_mm: f64) -> bool {
@@ -90,7 +92,11 @@ impl Comparison {
             100.0 * AGREEMENT
         );
         if !outside.is_empty() {
-            let _ = write!(out, "; outside, in mm: {}", outside.join(", "));
+            let named: Vec<&str> = outside.iter().take(NAMED).map(String::as_str).collect();
+            let _ = write!(out, "; outside, in mm: {}", named.join(", "));
+        }
+        if outside.len() > NAMED {
+            let _ = write!(out, " and {} more", outside.len() - NAMED);
         }
         out + "."
     }

@@ -148,7 +148,7 @@ const POSES: &str = "Methods with 12 or 18 image pairs look at 12 poses before t
     independent program states how widely its poses are spread in three directions (119, 70 and 45 \
     mm rms) and that none is nearer to the target than 10 cm, but neither these directions nor \
     where the middle is; both were chosen here among some thirty so that these methods agree with \
-    it. They matter: with a lens that the models do not know the limited HIPS ends 5 to 11 mm from \
+    it. They matter: with a lens that the models do not know the limited HIPS ends 4 to 14 mm from \
     the target, depending on which part of the lens the poses show, and the linear camera-space \
     method extrapolates the better the nearer they are.";
 

@@ -71,7 +71,8 @@ fn of_mark(study: &Experiment) -> Table<'_, Reference> {
 }
 
 fn of_tip(study: &Experiment) -> Table<'_, Reference> {
-    let mm = |x: f64| format!("{x:.1}");
+    // A zero has no sign.
+    let mm = |x: f64| format!("{:.1}", if x.abs() < 0.05 { 0.0 } else { x });
     Table::of(&study.references)
         .column("tip, vector taken at", |r| r.name.to_owned())
         .column("mark\u{2019}s vector: slope, mm/m", move |r| {

@@ -81,8 +81,8 @@ fn scatter(r: &Reference) -> String {
     };
     let others = vec![
         distance::dots(r, "field", GREEN, |p| p.field_noisy_mm),
-        ring("paper prints", ORANGE, 0.5),
-        ring("must mean", PURPLE, 5.0),
+        ring("printed", ORANGE, 0.5),
+        ring("meant", PURPLE, 5.0),
     ];
     distance::plot(r, others)
 }

@@ -90,8 +90,9 @@ impl Sensitivity {
             within * 100.0
         );
         if !apart.is_empty() {
-            out += "; not in these, where the first order cancels and what is left is quadratic in \
-                    the errors and of higher order (Jacobians against simulated): ";
+            out += "; not in these, where the first order cancels and rare draws dominate the rms of \
+                    what is left, which is of second and higher order (Jacobians against \
+                    simulated): ";
             out += &apart.join("; ");
         }
         out + "."
