@@ -140,6 +140,28 @@ impl Kind {
         }
     }
 
+    /// What the method is, in a few words.
+    pub fn title(self) -> &'static str {
+        match self {
+            Self::Kinematic => "kinematics alone, no image of the arm",
+            Self::Epec => "the paper's rule: the last error vector",
+            Self::EpecField => "EPEC with the vector as a field with a kinematic prior",
+            Self::EpecFieldFree => "the same, not anchored on the last vector",
+            Self::HipsLimited => "HIPS, camera models fitted once, to 12 initial poses",
+            Self::HipsFull => "HIPS, fitted to initial poses and every image",
+            Self::HipsApproach => "HIPS, fitted to the images of the approach alone",
+            Self::CameraSpace => "camera-space manipulation, six parameters per camera",
+            Self::CameraSpaceLinear => "camera-space manipulation, linear, eleven parameters",
+            Self::MountKabsch => "mount from point correspondences, rigid fit (Kabsch)",
+            Self::MountMap => "mount from point correspondences, weighted, with prior",
+            Self::KinematicCalibration => "kinematic calibration, all 26 errors, with prior",
+            Self::PositionBased => "position-based visual servoing, gain 1",
+            Self::PositionBasedHalf => "position-based visual servoing, gain 0.5",
+            Self::ImageBased => "image-based visual servoing, gain 1",
+            Self::ImageBasedBroyden => "image-based visual servoing, Jacobian by Broyden",
+        }
+    }
+
     /// What the method takes as known beforehand.
     pub fn needs(self) -> &'static str {
         match self {

@@ -30,6 +30,8 @@ pub enum Marks {
     Dots,
     /// The line alone.
     Line,
+    /// Open circles, for values of others.
+    Rings,
 }
 
 /// Some lines over common axes.
@@ -92,16 +94,85 @@ impl Axis {
         self.at_low + (x - self.low) / (self.high - self.low) * (self.at_high - self.at_low)
     }
 
-    /// A tick's number; a zero has no sign.
-    fn text(&self, x: f64) -> String {
+    /// A tick's number; a zero has no sign. On an axis of decades the tick is the power of ten.
+    fn text(&self, x: f64, decades: bool) -> String {
+        if decades {
+            return format!("{}", 10f64.powi(x.round() as i32));
+        }
         let x = if x.abs() < 1e-9 { 0.0 } else { x };
         format!("{x:.0$}", self.digits)
+    }
+}
+
+impl Series {
+    /// One point as this series shows it; nothing where the line is all.
+    fn mark(&self, u: f64, v: f64) -> String {
+        let (radius, style) = match self.marks {
+            Marks::Line => return String::new(),
+            Marks::Joined => (3.2, format!("fill=\"{}\"", self.colour)),
+            Marks::Dots => (2.2, format!("fill=\"{}\"", self.colour)),
+            Marks::Rings => (
+                5.0,
+                format!(
+                    "fill=\"none\" stroke=\"{}\" stroke-width=\"2\"",
+                    self.colour
+                ),
+            ),
+        };
+        format!("<circle cx=\"{u:.1}\" cy=\"{v:.1}\" r=\"{radius}\" {style}/>")
+    }
+
+    /// Its sign in the legend, `left` of its name.
+    fn key(&self, left: f64) -> String {
+        if matches!(self.marks, Marks::Dots | Marks::Rings) {
+            let series = Self {
+                name: self.name,
+                colour: self.colour,
+                points: Vec::new(),
+                marks: if self.marks == Marks::Dots {
+                    Marks::Joined
+                } else {
+                    Marks::Rings
+                },
+            };
+            return series.mark(left + 6.0, 32.0);
+        }
+        format!(
+            "<line x1=\"{left}\" x2=\"{}\" y1=\"32\" y2=\"32\" stroke=\"{}\" \
+             stroke-width=\"2\"/>{}",
+            left + 12.0,
+            self.colour,
+            self.mark(left + 6.0, 32.0)
+        )
     }
 }
 
 impl Plot {
     /// The plot; without points it says so.
     pub fn svg(&self) -> String {
+        self.drawn(false)
+    }
+
+    /// The plot with a logarithmic y axis; points that are not above zero are left out.
+    pub fn svg_in_decades(&self) -> String {
+        let in_decades = |s: &Series| Series {
+            points: s
+                .points
+                .iter()
+                .filter(|p| p.1 > 0.0)
+                .map(|p| (p.0, p.1.log10()))
+                .collect(),
+            ..*s
+        };
+        Self {
+            series: self.series.iter().map(in_decades).collect(),
+            from_zero: false,
+            ..*self
+        }
+        .drawn(true)
+    }
+
+    fn drawn(&self, decades: bool) -> String {
         let mut out = format!(
             "<svg class=\"plot\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\">\
              <text x=\"{LEFT}\" y=\"18\" class=\"title\">{}</text>",
@@ -112,18 +183,22 @@ impl Plot {
             return out
                 + "<text x=\"230\" y=\"140\" text-anchor=\"middle\">nothing seen</text></svg>";
         }
-        let (x, y) = self.axes(all());
+        let (x, y) = self.axes(all(), decades);
         let (bottom, right) = (HEIGHT - BOTTOM, WIDTH - RIGHT);
         for &t in &y.ticks {
             let v = y.at(t);
-            let zero = if t.abs() < 1e-9 { " zero" } else { "" };
+            let zero = if t.abs() < 1e-9 && !decades {
+                " zero"
+            } else {
+                ""
+            };
             let _ = write!(
                 out,
                 "<line x1=\"{LEFT}\" x2=\"{right}\" y1=\"{v:.1}\" y2=\"{v:.1}\" class=\"grid{zero}\"/>\
                  <text x=\"{}\" y=\"{:.1}\" text-anchor=\"end\">{}</text>",
                 LEFT - 7.0,
                 v + 4.0,
-                y.text(t)
+                y.text(t, decades)
             );
         }
         for &t in &x.ticks {
@@ -134,7 +209,7 @@ impl Plot {
                  <text x=\"{u:.1}\" y=\"{}\" text-anchor=\"middle\">{}</text>",
                 bottom + 4.0,
                 bottom + 17.0,
-                x.text(t)
+                x.text(t, false)
             );
         }
         let _ = write!(
@@ -156,44 +231,32 @@ impl Plot {
                 .iter()
                 .map(|p| format!("{:.1},{:.1}", x.at(p.0), y.at(p.1)))
                 .collect();
-            let line = s.marks != Marks::Dots;
-            let _ = write!(
-                out,
-                "<polyline points=\"{}\" fill=\"none\" stroke=\"{}\" stroke-width=\"2\"/>",
-                if line {
-                    points.join(" ")
-                } else {
-                    String::new()
-                },
-                s.colour
-            );
-            let dots = s.marks != Marks::Line;
-            for p in s.points.iter().filter(|_| dots) {
+            if matches!(s.marks, Marks::Joined | Marks::Line) {
                 let _ = write!(
                     out,
-                    "<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"{}\" fill=\"{}\"/>",
-                    x.at(p.0),
-                    y.at(p.1),
-                    if line { 3.2 } else { 2.2 },
+                    "<polyline points=\"{}\" fill=\"none\" stroke=\"{}\" stroke-width=\"2\"/>",
+                    points.join(" "),
                     s.colour
                 );
             }
+            for p in &s.points {
+                out += &s.mark(x.at(p.0), y.at(p.1));
+            }
             if self.series.len() > 1 && !s.name.is_empty() {
+                out += &s.key(legend);
                 let _ = write!(
                     out,
-                    "<circle cx=\"{}\" cy=\"32\" r=\"4\" fill=\"{}\"/><text x=\"{}\" y=\"36\">{}</text>",
-                    legend + 5.0,
-                    s.colour,
-                    legend + 13.0,
+                    "<text x=\"{}\" y=\"36\">{}</text>",
+                    legend + 16.0,
                     s.name
                 );
-                legend += 30.0 + 7.0 * s.name.len() as f64;
+                legend += 30.0 + 6.6 * s.name.chars().count() as f64;
             }
         }
         out + "</svg>"
     }
 
-    fn axes<'a>(&self, all: impl Iterator<Item = &'a (f64, f64)>) -> (Axis, Axis) {
+    fn axes<'a>(&self, all: impl Iterator<Item = &'a (f64, f64)>, decades: bool) -> (Axis, Axis) {
         let mut x = (f64::INFINITY, f64::NEG_INFINITY);
         let mut y = x;
         for p in all {
@@ -215,7 +278,7 @@ impl Plot {
         }
         (
             Axis::new(x.0, x.1, LEFT, WIDTH - RIGHT, 8.0, self.whole_x),
-            Axis::new(y.0, y.1, HEIGHT - BOTTOM, TOP, 5.0, false),
+            Axis::new(y.0, y.1, HEIGHT - BOTTOM, TOP, 5.0, decades),
         )
     }
 }
@@ -228,9 +291,9 @@ mod tests {
     fn ticks_are_round_numbers_inside_the_axis() {
         let axis = Axis::new(-0.3, 12.7, 0.0, 100.0, 5.0, false);
         assert_eq!(axis.ticks, [0.0, 5.0, 10.0]);
-        assert_eq!(axis.text(5.0), "5");
+        assert_eq!(axis.text(5.0, false), "5");
         let fine = Axis::new(0.0, 0.9, 0.0, 100.0, 5.0, false);
-        assert_eq!(fine.text(0.2), "0.2");
+        assert_eq!(fine.text(0.2, false), "0.2");
         let whole = Axis::new(0.7, 3.3, 0.0, 100.0, 8.0, true);
         assert_eq!(whole.ticks, [1.0, 2.0, 3.0]);
     }
@@ -253,5 +316,28 @@ mod tests {
         assert!(plot(vec![]).svg().contains("nothing seen"));
         let one = plot(vec![(1.0, 0.5)]).svg();
         assert!(one.contains("<circle") && !one.contains("NaN") && !one.contains("inf"));
+    }
+
+    #[test]
+    fn an_axis_of_decades_shows_powers_of_ten_and_leaves_out_what_has_no_logarithm() {
+        let plot = Plot {
+            title: "t",
+            x_label: "corrections",
+            y_label: "mm",
+            whole_x: true,
+            from_zero: false,
+            series: vec![Series {
+                name: "a",
+                colour: "#000",
+                points: vec![(0.0, 20.0), (1.0, 0.002), (2.0, 0.0)],
+                marks: Marks::Dots,
+            }],
+        };
+        let svg = plot.svg_in_decades();
+        for tick in [">10<", ">1<", ">0.1<", ">0.01<"] {
+            assert!(svg.contains(tick), "{tick}");
+        }
+        assert_eq!(svg.matches("<circle").count(), 2);
+        assert!(!svg.contains("inf") && !svg.contains("NaN"));
     }
 }

@@ -6,6 +6,9 @@
 //! one target, have no branch and no call, and the compiler turns them into vector code; where the
 //! processor has AVX2 a second copy of the same source, compiled for it, is taken. Both copies do
 //! the same IEEE operations and so give the same bits.
+//!
+//! Inverse and forward kinematics are loops of their own: each is a chain of operations that wait
+//! for one another, and in a short loop the processor works at several draws at once.
 
 use super::draws::fill_normals;
 use super::workspace::{CAMERA_CENTRE_M, ERRORS, JOINTS, ROWS, TOOL_M};
@@ -94,6 +97,12 @@ fn small(e: f64) -> (f64, f64) {
     (sine, cosine)
 }
 
+/// Sines and cosines of the joint angles of a block's draws.
+struct Joints {
+    sine: [[f64; BLOCK]; JOINTS],
+    cosine: [[f64; BLOCK]; JOINTS],
+}
+
 /// What the draws of a block make of arm and cameras: one array of draws for each quantity.
 struct Drawn {
     /// Sine and cosine of the joint angles' errors.
@@ -160,22 +169,39 @@ fn prepare(
 
 /// A point of link `j` as link `j - 1` has it, for draw `i`.
 #[inline(always)]
-fn down(p: [f64; 3], j: usize, q: &Turns, drawn: &Drawn, i: usize) -> [f64; 3] {
-    let (se, ce) = (drawn.theta[j][0][i], drawn.theta[j][1][i]);
-    let s = q.0[j] * ce + q.1[j] * se;
-    let c = q.1[j] * ce - q.0[j] * se;
+fn down(p: [f64; 3], j: usize, q: &Joints, drawn: &Drawn, i: usize) -> [f64; 3] {
     let (sa, ca) = (drawn.alpha[j][0][i], drawn.alpha[j][1][i]);
     let x = p[0] + drawn.a[j][i];
     let y = ca * p[1] - sa * p[2];
     let z = sa * p[1] + ca * p[2] + drawn.d[j][i];
+    turned([x, y, z], j, q, drawn, i)
+}
+
+/// A point turned by joint `j` of the true arm, for draw `i`.
+#[inline(always)]
+fn turned([x, y, z]: [f64; 3], j: usize, q: &Joints, drawn: &Drawn, i: usize) -> [f64; 3] {
+    let (se, ce) = (drawn.theta[j][0][i], drawn.theta[j][1][i]);
+    let (sq, cq) = (q.sine[j][i], q.cosine[j][i]);
+    let s = sq * ce + cq * se;
+    let c = cq * ce - sq * se;
     [c * x - s * y, s * x + c * y, z]
 }
 
 /// Where the cameras see the tip of the true arm at these joint angles, for draw `i`.
 #[inline(always)]
-fn seen(q: &Turns, drawn: &Drawn, i: usize) -> [f64; 3] {
+fn seen(q: &Joints, drawn: &Drawn, i: usize) -> [f64; 3] {
     // Written out so that the loop over draws remains the innermost one.
-    let p = down([0.0, 0.0, TOOL_M], 4, q, drawn, i);
+    let p = turned(
+        [
+            drawn.a[4][i],
+            -drawn.alpha[4][0][i] * TOOL_M,
+            drawn.alpha[4][1][i] * TOOL_M + drawn.d[4][i],
+        ],
+        4,
+        q,
+        drawn,
+        i,
+    );
     let p = down(p, 3, q, drawn, i);
     let p = down(p, 2, q, drawn, i);
     let p = down(p, 1, q, drawn, i);
@@ -191,27 +217,41 @@ fn seen(q: &Turns, drawn: &Drawn, i: usize) -> [f64; 3] {
     ]
 }
 
-/// One stage for `n` draws: the error of the present commands, and the next commands
+/// Joint angles for the commands of `n` draws.
+#[inline(always)]
+fn solve(commands: &[[f64; BLOCK]; 3], n: usize, target: &BatchTarget, joints: &mut Joints) {
+    let [px, py, pz] = commands;
+    let (sine, cosine) = (&mut joints.sine, &mut joints.cosine);
+    for i in 0..n.min(BLOCK) {
+        let p = [px[i], py[i], pz[i]];
+        let q = inverse(p, &target.axis, target.elbow, target.wrist);
+        for j in 0..JOINTS {
+            sine[j][i] = q.0[j];
+            cosine[j][i] = q.1[j];
+        }
+    }
+}
+
+/// The errors of the present joint angles of `n` draws, and the next commands
 /// `p <- p - (seen - target)`, which is the target minus the whole error vector.
 #[inline(always)]
-fn stage(
-    commands: &mut [[f64; BLOCK]; 3],
+fn correct(
+    joints: &Joints,
     n: usize,
     target: &BatchTarget,
     drawn: &Drawn,
+    commands: &mut [[f64; BLOCK]; 3],
     out: &mut [f32; BLOCK],
 ) {
     let [px, py, pz] = commands;
     let goal = target.point;
     for i in 0..n.min(BLOCK) {
-        let p = [px[i], py[i], pz[i]];
-        let q = inverse(p, &target.axis, target.elbow, target.wrist);
-        let at = seen(&q, drawn, i);
+        let at = seen(joints, drawn, i);
         let (x, y, z) = (at[0] - goal[0], at[1] - goal[1], at[2] - goal[2]);
         out[i] = (x * x + y * y + z * z).sqrt() as f32;
-        px[i] = p[0] - x;
-        py[i] = p[1] - y;
-        pz[i] = p[2] - z;
+        px[i] -= x;
+        py[i] -= y;
+        pz[i] -= z;
     }
 }
 
@@ -219,7 +259,9 @@ fn stage(
 struct Scratch {
     normals: [[f32; BLOCK]; ERRORS],
     drawn: Drawn,
+    joints: Joints,
     commands: [[f64; BLOCK]; 3],
+    errors: [[f32; BLOCK]; STAGES],
 }
 
 impl Scratch {
@@ -234,9 +276,30 @@ impl Scratch {
                 rotation: [[0.0; BLOCK]; 9],
                 translation: [[0.0; BLOCK]; 3],
             },
+            joints: Joints {
+                sine: [[0.0; BLOCK]; JOINTS],
+                cosine: [[0.0; BLOCK]; JOINTS],
+            },
             commands: [[0.0; BLOCK]; 3],
+            errors: [[0.0; BLOCK]; STAGES],
         }
     }
+}
+
+/// The random numbers of a block of `n` draws; those of one kind lie together.
+#[inline(always)]
+fn fill(key: u64, counter: u32, n: usize, normals: &mut [[f32; BLOCK]; ERRORS]) {
+    let n = n.min(BLOCK);
+    for (pair, rows) in normals.chunks_exact_mut(2).enumerate() {
+        let [first, second] = rows else { continue };
+        let at = counter.wrapping_add((pair * 2 * BLOCK) as u32);
+        fill_normals(key, at, &mut first[..n], &mut second[..n]);
+    }
+}
+
+/// Where the random numbers of the block that begins with this draw begin in their stream.
+fn counter(first_draw: usize) -> u32 {
+    (first_draw * ERRORS) as u32
 }
 
 /// A block of `n` draws, from the random numbers to the errors of all stages.
@@ -248,19 +311,30 @@ fn block(
     sigma: (f64, f64),
     twist: &Turns,
     scratch: &mut Scratch,
-    out: &mut [[f32; BLOCK]; STAGES],
 ) {
-    for (pair, rows) in scratch.normals.chunks_exact_mut(2).enumerate() {
-        let [first, second] = rows else { continue };
-        let at = counter.wrapping_add((pair * 2 * BLOCK) as u32);
-        fill_normals(key, at, &mut first[..n], &mut second[..n]);
-    }
+    fill(key, counter, n, &mut scratch.normals);
     prepare(&scratch.normals, n, sigma, twist, &mut scratch.drawn);
-    for (command, goal) in scratch.commands.iter_mut().zip(target.point) {
+    let Scratch {
+        drawn,
+        joints,
+        commands,
+        errors,
+        ..
+    } = scratch;
+    for (command, goal) in commands.iter_mut().zip(target.point) {
         command.fill(goal);
     }
-    for out in out {
-        stage(&mut scratch.commands, n, target, &scratch.drawn, out);
+    // The first command is the target itself, the same for all draws.
+    let (sine, cosine) = inverse(target.point, &target.axis, target.elbow, target.wrist);
+    for j in 0..JOINTS {
+        joints.sine[j].fill(sine[j]);
+        joints.cosine[j].fill(cosine[j]);
+    }
+    for (stage, errors) in errors.iter_mut().enumerate() {
+        if stage > 0 {
+            solve(commands, n, target, joints);
+        }
+        correct(joints, n, target, drawn, commands, errors);
     }
 }
 
@@ -273,67 +347,71 @@ fn block_avx2(
     sigma: (f64, f64),
     twist: &Turns,
     scratch: &mut Scratch,
-    out: &mut [[f32; BLOCK]; STAGES],
 ) {
-    block(stream, n, target, sigma, twist, scratch, out);
+    block(stream, n, target, sigma, twist, scratch);
 }
 
-/// The errors of `trials` independent draws of all 26 model errors at one target; `key` names the
-/// stream of draws, `angle_rad` and `length_m` are the standard deviations.
-pub fn trials(
-    key: u64,
-    trials: usize,
-    target: &BatchTarget,
-    angle_rad: f64,
-    length_m: f64,
-) -> BatchErrors {
-    let mut result = BatchErrors {
-        errors_m: std::array::from_fn(|_| Vec::with_capacity(trials)),
-    };
-    let twist = (
-        ROWS.map(|r| r[2].sin()),
-        // The twists are whole quarter turns; their cosine has no business being 6e-17.
-        ROWS.map(|r| if r[2] == 0.0 { 1.0 } else { 0.0 }),
-    );
-    let sigma = (angle_rad, length_m);
-    let mut out = [[0.0; BLOCK]; STAGES];
-    let mut scratch = Scratch::new();
-    let mut done = 0;
-    let mut counter = 0_u32;
-    while done < trials {
-        let stream = (key, counter);
-        let kept = (trials - done).min(BLOCK);
-        // Whole vectors: the surplus is dropped.
-        let n = kept.next_multiple_of(8).min(BLOCK);
-        #[cfg(target_arch = "x86_64")]
-        if is_x86_feature_detected!("avx2") {
-            // SAFETY: the processor has AVX2.
-            unsafe { block_avx2(stream, n, target, sigma, &twist, &mut scratch, &mut out) };
-        } else {
-            block(stream, n, target, sigma, &twist, &mut scratch, &mut out);
+/// Computes batches of draws, one after the other.
+pub struct Batch {
+    scratch: Box<Scratch>,
+    twist: Turns,
+}
+
+impl Default for Batch {
+    fn default() -> Self {
+        Self {
+            scratch: Box::new(Scratch::new()),
+            twist: (
+                ROWS.map(|r| r[2].sin()),
+                // The twists are whole quarter turns; their cosine has no business being 6e-17.
+                ROWS.map(|r| if r[2] == 0.0 { 1.0 } else { 0.0 }),
+            ),
         }
-        #[cfg(not(target_arch = "x86_64"))]
-        block(stream, n, target, sigma, &twist, &mut scratch, &mut out);
-        for (errors, block) in result.errors_m.iter_mut().zip(&out) {
-            errors.extend_from_slice(&block[..kept]);
-        }
-        done += kept;
-        counter = counter.wrapping_add((ERRORS * BLOCK) as u32);
     }
-    result
 }
 
-/// The 26 standard normal numbers of one draw of [`trials`], for checks against other code.
+impl Batch {
+    /// The errors of `trials` independent draws of all 26 model errors at one target; `key` names
+    /// the stream of draws, `angle_rad` and `length_m` are the standard deviations.
+    pub fn trials(
+        &mut self,
+        key: u64,
+        trials: usize,
+        target: &BatchTarget,
+        angle_rad: f64,
+        length_m: f64,
+    ) -> BatchErrors {
+        let mut result = BatchErrors {
+            errors_m: std::array::from_fn(|_| Vec::with_capacity(trials)),
+        };
+        let (scratch, twist) = (&mut *self.scratch, &self.twist);
+        let sigma = (angle_rad, length_m);
+        for first in (0..trials).step_by(BLOCK) {
+            let stream = (key, counter(first));
+            let kept = (trials - first).min(BLOCK);
+            // Whole vectors: the surplus is dropped.
+            let n = kept.next_multiple_of(8).min(BLOCK);
+            #[cfg(target_arch = "x86_64")]
+            if is_x86_feature_detected!("avx2") {
+                // SAFETY: the processor has AVX2.
+                unsafe { block_avx2(stream, n, target, sigma, twist, scratch) };
+            } else {
+                block(stream, n, target, sigma, twist, scratch);
+            }
+            #[cfg(not(target_arch = "x86_64"))]
+            block(stream, n, target, sigma, twist, scratch);
+            for (errors, block) in result.errors_m.iter_mut().zip(&scratch.errors) {
+                errors.extend_from_slice(&block[..kept]);
+            }
+        }
+        result
+    }
+}
+
+/// The 26 standard normal numbers of one draw of [`Batch::trials`], for checks against other code.
 #[cfg(test)]
 pub fn draw(key: u64, trial: usize) -> [f64; ERRORS] {
-    let counter = (trial / BLOCK * ERRORS * BLOCK) as u32;
-    let mut e = [0.0; ERRORS];
-    for (pair, e) in e.chunks_exact_mut(2).enumerate() {
-        let (mut first, mut second) = ([0.0; BLOCK], [0.0; BLOCK]);
-        let at = counter.wrapping_add((pair * 2 * BLOCK) as u32);
-        fill_normals(key, at, &mut first, &mut second);
-        e[0] = f64::from(first[trial % BLOCK]);
-        e[1] = f64::from(second[trial % BLOCK]);
-    }
-    e
+    let mut normals = [[0.0; BLOCK]; ERRORS];
+    fill(key, counter(trial / BLOCK * BLOCK), BLOCK, &mut normals);
+    normals.map(|of_all| f64::from(of_all[trial % BLOCK]))
 }

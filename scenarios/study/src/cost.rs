@@ -130,7 +130,7 @@ impl Cost {
             let c = of(kind)?;
             let ratio = c.cycle_us / epec.cycle_us;
             Some(format!(
-                "{} {ratio:.0} times as much ({:.1} us, {:.2} ms in flight)",
+                "{} takes {ratio:.0} times as much ({:.1} us, {:.2} ms in flight)",
                 kind.name(),
                 c.cycle_us,
                 c.flight_ms
@@ -140,7 +140,7 @@ impl Cost {
         format!(
             "A cycle of EPEC with six sightings takes {:.2} us here, {:.3} ms on the assumed 200 \
              MHz processor ({:.0} times slower), keeps {} bytes and does not grow with the number \
-             of sightings. For the same: {}. Finding the fiducial in the images costs every method \
+             of sightings. With the same six sightings {}. Finding the fiducial in the images costs every method \
              the same and is not in these numbers.",
             epec.cycle_us,
             epec.flight_ms,

@@ -20,6 +20,7 @@ pub mod cost;
 pub mod detectors;
 pub mod draws;
 pub mod experiment;
+pub mod growth;
 pub mod locality;
 pub mod report;
 pub mod sensitivity;

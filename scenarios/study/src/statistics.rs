@@ -13,9 +13,11 @@ pub fn quantile(x: &mut [f64], p: f64) -> f64 {
     }
     let rank = (p * x.len() as f64).ceil() as usize;
     let at = rank.clamp(1, x.len()) - 1;
-    let order = |a: &f64, b: &f64| (a.is_nan(), a).partial_cmp(&(b.is_nan(), b));
-    let (_, value, _) =
-        x.select_nth_unstable_by(at, |a, b| order(a, b).unwrap_or(std::cmp::Ordering::Equal));
+    // In the total order this NaN, which is positive, comes last.
+    for value in x.iter_mut().filter(|v| v.is_nan()) {
+        *value = f64::NAN;
+    }
+    let (_, value, _) = x.select_nth_unstable_by(at, f64::total_cmp);
     *value
 }
 

@@ -18,7 +18,7 @@ use rover_kinematics::{AxisGoal, closest_solution};
 use rover_messages::{
     Fault,
     imaging::{RawPair, StereoFrame},
-    placement::{Observation, PlaceGoal, PlaceResult},
+    placement::{Method, Observation, PlaceGoal, PlaceResult},
     planning::{PlanGoal, ToolPose},
     target::Target,
 };
@@ -33,6 +33,10 @@ pub const PAIR: &str = "body";
 const START: &str = "ready";
 /// Height of the floor, m: below everything that the arm is sent to.
 const FLOOR_M: f64 = 0.0;
+/// Tolerance that ends the servo's loop with its first look at a station, m.
+const ANY_M: f64 = 0.1;
+/// No placement is refused for what is predicted of it.
+const NO_LIMIT_M: f64 = 1.0;
 /// Steps after which a placement that has not ended is a fault.
 const MOST_STEPS: u32 = 400;
 
@@ -118,6 +122,24 @@ impl Testbed {
             believed_from_true,
             frames: BTreeMap::new(),
         })
+    }
+}
+
+/// A placement with one look at each of these heights above the target (m), which nothing that is
+/// predicted of it refuses.
+pub fn single_looks(
+    target: &Target,
+    (method, observation): (Method, Observation),
+    stations_m: Vec<f64>,
+) -> PlaceGoal {
+    PlaceGoal {
+        target: target.clone(),
+        stations_m,
+        method,
+        observation,
+        tolerance_m: ANY_M,
+        max_corrections_n: 1,
+        max_predicted_error_m: NO_LIMIT_M,
     }
 }
 

@@ -18,6 +18,7 @@ use published::independent;
 use rayon::prelude::*;
 use rover_methods::Kind;
 use serde::Serialize;
+pub use verdict::is_better;
 
 /// Trials of one cell of the numeric cases.
 pub const TRIALS: usize = 200;
@@ -98,6 +99,8 @@ pub struct Comparison {
 pub struct Cell {
     /// The method.
     pub name: &'static str,
+    /// What it is.
+    pub title: &'static str,
     /// The case.
     pub case: Case,
     /// Length of the blind last part, cm.
@@ -236,6 +239,7 @@ fn cell(kind: Kind, case: Case, occlusion_cm: u32, outcomes: &[Option<Outcome>])
     let looks = if kind.looks_on_approach() { LOOKS } else { 0 };
     Cell {
         name: kind.name(),
+        title: kind.title(),
         case,
         occlusion_cm,
         median_mm: of_all(|o| o.error_m * 1e3, 0.5),

@@ -16,6 +16,8 @@ use std::{sync::Arc, time::Instant};
 const INITIAL_POSES: usize = 12;
 /// Noise of a pixel coordinate, of the target and of the fiducial, px.
 const NOISE_PX: f64 = 0.05;
+/// How far from the approach the sightings of the study of cost are, m.
+const SIDEWAYS_M: f64 = 0.06;
 /// The paper's tool, without the last half millimetre.
 const TIP_M: f64 = 0.130;
 /// The paper's cameras.
@@ -182,16 +184,18 @@ impl Truth {
         })
     }
 
-    /// The poses over the view, none nearer to the target than 10 cm. Their spread is that of the
-    /// independent program; their height, which it does not state, was chosen so that the limited
-    /// HIPS agrees with it.
+    /// The poses over the view, none nearer to the target than 10 cm. Their spread in three
+    /// directions is that of the independent program. It does not state which directions these are
+    /// and where the middle is; both were chosen so that the methods which use the poses agree
+    /// with it: how the limited HIPS bears a lens that it does not know depends on what part of
+    /// the lens the poses show (4 to 14 mm).
     fn look_around(&mut self, draws: &mut Draws) {
         let mut near = self.first_joints();
         while self.initial.len() < INITIAL_POSES {
             let at = Vector3::new(
-                draws.between(0.38, 0.62),
-                draws.between(-0.206, 0.206),
-                draws.between(0.01, 0.17),
+                draws.between(0.224, 0.636),
+                draws.between(-0.121, 0.121),
+                draws.between(-0.028, 0.128),
             );
             let axis = Unit::new_normalize(Vector3::new(
                 draws.between(-0.25, 0.25),
@@ -217,8 +221,8 @@ impl Truth {
     }
 }
 
-/// The plain case's believed robot, a target, and sightings over the view and then along an
-/// approach that ends at the target, for measurements of cost.
+/// The plain case's believed robot, a target, and sightings around an approach to it, for
+/// measurements of cost.
 ///
 /// # Errors
 /// [`StudyError`].
@@ -236,12 +240,14 @@ pub fn sightings(
         what: "cost: a sighting out of reach or view",
     };
     for k in 0..count {
-        let left = 1.0 - k as f64 / count.max(2) as f64;
-        // A bent way, so that every method's equations have a solution.
-        let sideways = Vector3::new(-0.08 * left, 0.12 * (9.0 * left).sin() * left, 0.0);
+        // Scattered evenly around the approach, so that every
+        // method's equations have a solution with the first few, too.
+        let along = (0.5 + 0.754_877_666 * k as f64).fract();
+        let (sine, cosine) = (2.399_963_229_7 * k as f64).sin_cos();
+        let sideways = Vector3::new(SIDEWAYS_M * cosine, SIDEWAYS_M * sine, 0.0);
         let reference = Reference {
             tip_in_rover: goal.tip_in_rover
-                + truth.upward.into_inner() * (START_M * left)
+                + truth.upward.into_inner() * (START_M * along)
                 + sideways,
             axis_in_rover: goal.axis_in_rover,
         };

@@ -5,16 +5,12 @@ use super::{Case, LOOKS, Outcome, Outcomes, by_trial, distance_m};
 use crate::{
     StudyError,
     draws::{Draws, key},
-    testbed::{Drawn, PAIR, Testbed},
+    testbed::{Drawn, PAIR, Testbed, single_looks},
 };
 use nalgebra::{Unit, Vector3};
 use rover_epec_servo::{estimator::EstimatorRules, place::error_model, survey::is_visible};
 use rover_geometry::{Direction, Rover};
-use rover_messages::{
-    placement::{Observation, PlaceGoal},
-    planning::ToolPose,
-    target::Target,
-};
+use rover_messages::{placement::Observation, planning::ToolPose, target::Target};
 use rover_methods::Kind;
 use rover_sim::IntrinsicsError;
 
@@ -25,10 +21,6 @@ const DEGRADED: IntrinsicsError = IntrinsicsError {
 };
 /// Tilt of the target's normal from the vertical, per axis, one sigma, rad.
 const TILT: f64 = 0.1;
-/// Tolerance that ends the servo's loop with its first look at a station, m.
-const ANY_M: f64 = 0.1;
-/// No placement is refused for what is predicted of it.
-const NO_LIMIT_M: f64 = 1.0;
 /// Places tried for a target that is seen from start to end.
 const MOST_PLACES: u32 = 2000;
 
@@ -82,18 +74,11 @@ impl Trial {
 
     fn place(&mut self, kind: Kind, case: Case, occlusion_cm: u32) -> Option<Outcome> {
         let stations = (0..LOOKS).map(|k| distance_m(k, occlusion_cm));
-        let goal = PlaceGoal {
-            target: self.target.clone(),
-            stations_m: stations.collect(),
-            method: kind,
-            observation: match case {
-                Case::ImagesPlate => Observation::Pose,
-                _ => Observation::Position,
-            },
-            tolerance_m: ANY_M,
-            max_corrections_n: 1,
-            max_predicted_error_m: NO_LIMIT_M,
+        let observation = match case {
+            Case::ImagesPlate => Observation::Pose,
+            _ => Observation::Position,
         };
+        let goal = single_looks(&self.target, (kind, observation), stations.collect());
         // What the detector finds counts: with wrong lenses no sighting agrees with a filter
         // that takes them for right, and the methods shall be compared, not the filter.
         let rules = EstimatorRules {

@@ -15,8 +15,9 @@ pub use sources::AtReference;
 
 use super::{
     StudyConfig, StudyError,
+    growth::Growth,
     locality::{self, locality},
-    statistics::{Line, mean},
+    statistics::mean,
     testbed::{PAIR, Testbed},
 };
 use nalgebra::{Unit, Vector3};
@@ -32,8 +33,6 @@ use serde::Serialize;
 pub const TRIALS: usize = 20;
 /// Draws of the numeric study whose slope is drawn in.
 const THEORY_TRIALS: usize = 60;
-/// Distances that the straight line is fitted to, m.
-const FITTED_M: (f64, f64) = (0.02, 0.40);
 /// Calibrated cameras are never exact; the paper names that as what steepens the slope.
 const INTRINSICS: IntrinsicsError = IntrinsicsError {
     focal_fraction: 1e-3,
@@ -64,16 +63,11 @@ pub struct Reference {
     pub position_m: [f64; 3],
     /// The targets, by distance.
     pub points: Vec<ExperimentPoint>,
-    /// Slope of the error of one vector, mm/m.
-    pub slope_mm_per_m: f64,
+    /// The mark's error with one vector against distance.
+    #[serde(flatten)]
+    pub vector: Growth,
     /// Mean error of the mark at the place itself, mm.
     pub at_reference_mm: f64,
-    /// The line's value at no distance, mm.
-    pub intercept_mm: f64,
-    /// Share of the variance that the line explains.
-    pub r2: f64,
-    /// The line's value at 16 cm, mm.
-    pub error_at_16cm_mm: f64,
     /// Slope of the error of one vector if sight had no error, mm/m.
     pub exact_slope_mm_per_m: f64,
     /// Slope of the tip's error with the field made from looks at the mark, mm/m.
@@ -242,34 +236,25 @@ fn reference(
         });
     }
     points.sort_by(|a, b| a.distance_m.total_cmp(&b.distance_m));
-    let line = |of: fn(&ExperimentPoint) -> f64| {
-        let fitted: Vec<(f64, f64)> = points
-            .iter()
-            .filter(|p| (FITTED_M.0..=FITTED_M.1).contains(&p.distance_m))
-            .map(|p| (p.distance_m, of(p)))
-            .collect();
-        Line::fit(&fitted).ok_or_else(none)
+    let growth = |of: fn(&ExperimentPoint) -> f64| {
+        Growth::of(points.iter().map(|p| (p.distance_m, of(p))), "experiment")
     };
     let at_reference = points.first().filter(|p| p.distance_m < 1e-9);
-    let vector = line(|p| p.error_mm)?;
-    let tip = line(|p| p.tip_mm)?;
-    let plate = line(|p| p.plate_mm)?;
+    let tip = growth(|p| p.tip_mm)?;
+    let plate = growth(|p| p.plate_mm)?;
     Ok(Reference {
         name: theory.name,
         position_m: (*place).into(),
-        slope_mm_per_m: vector.slope,
+        vector: growth(|p| p.error_mm)?,
         at_reference_mm: at_reference.ok_or_else(none)?.error_mm,
-        intercept_mm: vector.intercept,
-        r2: vector.r2,
-        error_at_16cm_mm: vector.at(0.16),
-        exact_slope_mm_per_m: line(|p| p.exact_mm)?.slope,
-        field_slope_mm_per_m: line(|p| p.field_mm)?.slope,
-        tip_slope_mm_per_m: tip.slope,
-        tip_intercept_mm: tip.intercept,
-        plate_slope_mm_per_m: plate.slope,
-        plate_intercept_mm: plate.intercept,
-        predicted_slope_mm_per_m: theory.slope_mm_per_m,
-        predicted_intercept_mm: theory.intercept_mm,
+        exact_slope_mm_per_m: growth(|p| p.exact_mm)?.slope_mm_per_m,
+        field_slope_mm_per_m: growth(|p| p.field_mm)?.slope_mm_per_m,
+        tip_slope_mm_per_m: tip.slope_mm_per_m,
+        tip_intercept_mm: tip.intercept_mm,
+        plate_slope_mm_per_m: plate.slope_mm_per_m,
+        plate_intercept_mm: plate.intercept_mm,
+        predicted_slope_mm_per_m: theory.vector.slope_mm_per_m,
+        predicted_intercept_mm: theory.vector.intercept_mm,
         robots: points.iter().map(|p| p.robots).max().unwrap_or(0),
         points,
     })

@@ -3,24 +3,20 @@
 use super::down;
 use crate::{
     StudyConfig, StudyError,
-    testbed::{Drawn, Testbed},
+    testbed::{Drawn, Testbed, single_looks},
 };
 use nalgebra::Vector3;
 use rover_compensation::Compensation;
 use rover_epec_servo::estimator::EstimatorRules;
 use rover_messages::{
     Fault,
-    placement::{Method, Observation, PlaceGoal},
+    placement::{Method, Observation},
     target::Target,
 };
 
 /// Looks of the field, and how far above the reference place the first one is, m.
 const LOOKS: usize = 6;
 const APPROACH_M: f64 = 0.12;
-/// Tolerance that ends the servo's loop with its first look at a station, m.
-const ANY_M: f64 = 0.1;
-/// No placement is refused for what is predicted of it.
-const NO_LIMIT_M: f64 = 1.0;
 
 /// Errors of one robot at one target, mm.
 #[derive(Clone, Copy, Debug)]
@@ -38,16 +34,21 @@ pub(super) fn seed(config: &StudyConfig, trial: u64) -> u64 {
     crate::draws::key(config.seed, &[9, trial])
 }
 
+/// Vectors seen in pictures taken at a place.
+pub(super) struct Seen {
+    /// The mark's vector, the mark at the place.
+    pub(super) mark: Compensation,
+    /// The mark's vector, the tip at the place.
+    pub(super) tip: Compensation,
+    /// The plate's pose, the tip at the place.
+    pub(super) plate: Compensation,
+}
+
 /// What was learnt at a reference place.
 struct Learnt {
-    /// The mark's vector, the mark at the place.
-    mark: Compensation,
-    /// The same if sight had no error.
+    seen: Seen,
+    /// The mark's vector, the mark at the place, if sight had no error.
     exact: Compensation,
-    /// The mark's vector, the tip at the place.
-    tip: Compensation,
-    /// The plate's pose, the tip at the place.
-    plate: Compensation,
     /// Looks at the mark while the tip comes down on the place.
     field: Compensation,
 }
@@ -98,18 +99,10 @@ fn way_down(looks: usize) -> Vec<f64> {
 pub(super) fn look(
     robot: &mut Drawn,
     target: &Target,
-    (method, observation): (Method, Observation),
+    by: (Method, Observation),
     stations_m: Vec<f64>,
 ) -> Result<Compensation, Fault> {
-    let goal = PlaceGoal {
-        target: target.clone(),
-        stations_m,
-        method,
-        observation,
-        tolerance_m: ANY_M,
-        max_corrections_n: 1,
-        max_predicted_error_m: NO_LIMIT_M,
-    };
+    let goal = single_looks(target, by, stations_m);
     let placed = robot.place(&goal, EstimatorRules::default())?;
     if !placed.result.looks.iter().any(|l| l.found) {
         return Err(Fault::new(
@@ -121,21 +114,29 @@ pub(super) fn look(
     Ok(placed.result.compensation)
 }
 
+/// The paper's way to look, and the plate's.
+pub(super) const BY_MARK: (Method, Observation) = (Method::Epec, Observation::Position);
+const BY_PLATE: (Method, Observation) = (Method::Epec, Observation::Pose);
+
+impl Seen {
+    /// Takes the pictures.
+    pub(super) fn at(robot: &mut Drawn, target: &Target) -> Result<Self, Fault> {
+        let under_mark = robot.under_mark(target)?;
+        Ok(Self {
+            mark: look(robot, &under_mark, BY_MARK, vec![0.0])?,
+            tip: look(robot, target, BY_MARK, vec![0.0])?,
+            plate: look(robot, target, BY_PLATE, vec![0.0])?,
+        })
+    }
+}
+
 fn learn(robot: &mut Drawn, place: &Vector3<f64>, target: &Target) -> Result<Learnt, Fault> {
-    let position = (Method::Epec, Observation::Position);
-    let under_mark = robot.under_mark(target)?;
     let [exact, ..] = robot.exact_vectors(&robot.exact_target(place, &-down()))?;
+    let by_field = (Method::EpecField, Observation::Position);
     Ok(Learnt {
         exact,
-        mark: look(robot, &under_mark, position, vec![0.0])?,
-        tip: look(robot, target, position, vec![0.0])?,
-        plate: look(robot, target, (Method::Epec, Observation::Pose), vec![0.0])?,
-        field: look(
-            robot,
-            target,
-            (Method::EpecField, Observation::Position),
-            way_down(LOOKS),
-        )?,
+        seen: Seen::at(robot, target)?,
+        field: look(robot, target, by_field, way_down(LOOKS))?,
     })
 }
 
@@ -176,11 +177,11 @@ fn measured(
     let exact_target = robot.exact_target(at, &-down());
     let of_tip = |c: &Compensation| tip_error_mm(robot, c, target, at, near);
     let all = (
-        of_mark(&learnt.mark)?,
+        of_mark(&learnt.seen.mark)?,
         mark_error_mm(robot, &learnt.exact, &exact_target, at, near)?,
         of_mark(&Compensation::none())?,
-        of_tip(&learnt.tip)?,
-        of_tip(&learnt.plate)?,
+        of_tip(&learnt.seen.tip)?,
+        of_tip(&learnt.seen.plate)?,
         of_tip(&learnt.field)?,
     );
     Ok(match all {

@@ -3,17 +3,13 @@
 
 use super::{
     down,
-    robot::{look, mark_error_mm, seed, tip_error_mm},
+    robot::{BY_MARK, Seen, look, mark_error_mm, seed, tip_error_mm},
 };
 use crate::{StudyConfig, StudyError, statistics::mean, testbed::Testbed};
 use nalgebra::Vector3;
 use rayon::prelude::*;
 use rover_compensation::Compensation;
-use rover_messages::{
-    Fault,
-    placement::{Method, Observation},
-    target::Target,
-};
+use rover_messages::{Fault, target::Target};
 use rover_sim::{IntrinsicsError, SimulationDescription};
 use serde::Serialize;
 
@@ -168,14 +164,8 @@ fn one_robot(
 
 fn in_pictures(robot: &mut crate::testbed::Drawn, place: &Vector3<f64>) -> Result<Vectors, Fault> {
     let target = robot.target(place, &-down())?;
+    let Seen { mark, tip, plate } = Seen::at(robot, &target)?;
     let under_mark = robot.under_mark(&target)?;
-    let position = (Method::Epec, Observation::Position);
-    let pose = (Method::Epec, Observation::Pose);
-    let vectors = [
-        look(robot, &under_mark, position, vec![0.0])?,
-        look(robot, &under_mark, position, vec![0.0, 0.0])?,
-        look(robot, &target, position, vec![0.0])?,
-        look(robot, &target, pose, vec![0.0])?,
-    ];
-    Ok((target, vectors))
+    let second = look(robot, &under_mark, BY_MARK, vec![0.0, 0.0])?;
+    Ok((target, [mark, second, tip, plate]))
 }

@@ -6,7 +6,8 @@ mod field;
 use super::{
     StudyConfig, StudyError,
     draws::Draws,
-    statistics::{Line, mean},
+    growth::{Growth, range},
+    statistics::mean,
     workspace::{LEVELS, TARGETS, targets, usual_posture},
     world::{TrueRobot, believed},
 };
@@ -19,8 +20,6 @@ use serde::Serialize;
 
 /// Draws of the robot in the paper.
 pub const PAPER_TRIALS: usize = 100;
-/// Distances that the straight line is fitted to, m.
-const FITTED_M: (f64, f64) = (0.02, 0.40);
 /// Vectors that the field is made from.
 const LOOKS: usize = 6;
 /// Noise that the field assumes where there is none, m.
@@ -52,14 +51,11 @@ pub struct Reference {
     pub position_m: [f64; 3],
     /// The targets, by distance.
     pub points: Vec<LocalityPoint>,
-    /// Slope of the error of one vector, mm/m.
-    pub slope_mm_per_m: f64,
-    /// The line's value at no distance, mm.
-    pub intercept_mm: f64,
-    /// Share of the variance that the line explains.
-    pub r2: f64,
-    /// The line's value at 16 cm, mm.
-    pub error_at_16cm_mm: f64,
+    /// The error of one vector against distance.
+    #[serde(flatten)]
+    pub vector: Growth,
+    /// Mean error at the place itself, mm.
+    pub at_reference_mm: f64,
     /// Distance at which the line reaches 5 mm, m; none if it never does.
     pub five_mm_at_m: Option<f64>,
     /// Slope of the field's error, exact vectors, mm/m.
@@ -207,27 +203,20 @@ fn reference(
         });
     }
     points.sort_by(|a, b| a.distance_m.total_cmp(&b.distance_m));
-    let line = |of: fn(&LocalityPoint) -> f64| {
-        let fitted: Vec<(f64, f64)> = points
-            .iter()
-            .filter(|p| (FITTED_M.0..=FITTED_M.1).contains(&p.distance_m))
-            .map(|p| (p.distance_m, of(p)))
-            .collect();
-        Line::fit(&fitted).ok_or(StudyError::NoTrials { what: "locality" })
+    let growth = |of: fn(&LocalityPoint) -> f64| {
+        Growth::of(points.iter().map(|p| (p.distance_m, of(p))), "locality")
     };
-    let vector = line(|p| p.error_mm)?;
-    let five = (5.0 - vector.intercept) / vector.slope;
+    let vector = growth(|p| p.error_mm)?;
+    let none = StudyError::NoTrials { what: "locality" };
     Ok(Reference {
         name,
         position_m: source.point.into(),
-        slope_mm_per_m: vector.slope,
-        intercept_mm: vector.intercept,
-        r2: vector.r2,
-        error_at_16cm_mm: vector.at(0.16),
-        five_mm_at_m: (five.is_finite() && five > 0.0).then_some(five),
-        field_slope_mm_per_m: line(|p| p.field_mm)?.slope,
-        field_noisy_slope_mm_per_m: line(|p| p.field_noisy_mm)?.slope,
-        field_straight_slope_mm_per_m: line(|p| p.field_straight_mm)?.slope,
+        vector,
+        at_reference_mm: points.first().ok_or(none)?.error_mm,
+        five_mm_at_m: vector.reaches_m(5.0),
+        field_slope_mm_per_m: growth(|p| p.field_mm)?.slope_mm_per_m,
+        field_noisy_slope_mm_per_m: growth(|p| p.field_noisy_mm)?.slope_mm_per_m,
+        field_straight_slope_mm_per_m: growth(|p| p.field_straight_mm)?.slope_mm_per_m,
         field_coverage: held as f64 / f64::from(predictions.max(1) as u32),
         field_noisy_coverage: held_noisy as f64 / f64::from(predictions.max(1) as u32),
         looks: exact.looks.len(),
@@ -319,29 +308,27 @@ fn one_robot(
 impl Locality {
     /// What the study says, from its own numbers.
     pub fn verdict(&self) -> String {
-        let range = |of: &dyn Fn(&Reference) -> f64| {
-            let values = self.references.iter().map(of);
-            values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), x| {
-                (a.min(x), b.max(x))
-            })
-        };
-        let (low, high) = range(&|r| r.slope_mm_per_m);
-        let (r2, _) = range(&|r| r.r2);
-        let (near, far) = range(&|r| r.error_at_16cm_mm);
-        let (_, field) = range(&|r| r.field_slope_mm_per_m / r.slope_mm_per_m);
-        let (_, noisy) = range(&|r| r.field_noisy_slope_mm_per_m / r.slope_mm_per_m);
-        let (_, straight) = range(&|r| r.field_straight_slope_mm_per_m / r.slope_mm_per_m);
-        let (covered, _) = range(&|r| r.field_noisy_coverage);
+        let over = |of: &dyn Fn(&Reference) -> f64| range(self.references.iter().map(of));
+        let (low, high) = over(&|r| r.vector.slope_mm_per_m);
+        let (r2, _) = over(&|r| r.vector.r2);
+        let (least, most) = over(&|r| r.at_reference_mm);
+        let (near, far) = over(&|r| r.vector.error_at_16cm_mm);
+        let (five, till) = over(&|r| r.five_mm_at_m.unwrap_or(f64::NAN) * 100.0);
+        let (_, field) = over(&|r| r.field_slope_mm_per_m / r.vector.slope_mm_per_m);
+        let (_, noisy) = over(&|r| r.field_noisy_slope_mm_per_m / r.vector.slope_mm_per_m);
+        let (_, straight) = over(&|r| r.field_straight_slope_mm_per_m / r.vector.slope_mm_per_m);
+        let (covered, _) = over(&|r| r.field_noisy_coverage);
         format!(
-            "The error grows linearly with the distance from where the vector was taken (at least \
-             {:.0} % of the variance), by {low:.0} to {high:.0} mm per metre: at 16 cm it is \
-             {near:.1} to {far:.1} mm. The paper's sentence that .5 mm is kept as far as 16 cm \
-             away contradicts its own table, which has 1.2 mm at no distance for the same errors; \
-             it must read .5 cm, 5 mm. With six vectors seen along a bent approach the field with a \
-             kinematic prior grows at most {field:.2} times as fast, {noisy:.2} times when each \
-             vector has 0.3 mm of noise, and its 95 % ellipsoids held the true vector in at least \
-             {:.0} % of the predictions. The approach's \
-             shape was chosen among some twenty; every look on it is in the cameras' view. A straight one of 12 cm shows less of the robot: the field then grows at most {straight:.2} times as fast as one vector.",
+            "The error grows linearly with the distance from where the vector was taken, as the \
+             paper says (the line explains at least {:.0} % of the variance), by {low:.0} to \
+             {high:.0} mm per metre. At the place itself it is {least:.1} to {most:.1} mm (the \
+             paper's table: 1.2), at 16 cm {near:.1} to {far:.1} mm, and 5 mm are reached at \
+             {five:.0} to {till:.0} cm: the paper's .5 mm at 16 cm must read .5 cm. With six \
+             vectors seen along a bent approach the error of the field with a kinematic prior \
+             grows at most {field:.2} times as fast as that of one vector, {noisy:.2} times when \
+             each vector has 0.3 mm of noise; with such noise its 95 % ellipsoids held the true \
+             vector in at least {:.0} % of the predictions. From a straight 12 cm, which show less \
+             of the robot, it grows at most {straight:.2} times as fast.",
             r2 * 100.0,
             covered * 100.0
         )
@@ -359,15 +346,12 @@ mod tests {
             let study = locality(&StudyConfig::new(seed, 30, None)).unwrap();
             assert_eq!(study.references.len(), 3);
             for r in &study.references {
-                let (vector, field) = (r.slope_mm_per_m, r.field_slope_mm_per_m);
+                let (vector, field) = (r.vector.slope_mm_per_m, r.field_slope_mm_per_m);
                 let noisy = r.field_noisy_slope_mm_per_m;
                 assert!((25.0..40.0).contains(&vector), "{}: {vector}", r.name);
-                assert!(r.r2 > 0.85, "{}: {}", r.name, r.r2);
-                assert!(
-                    (4.5..7.0).contains(&r.error_at_16cm_mm),
-                    "{}",
-                    r.error_at_16cm_mm
-                );
+                assert!(r.vector.r2 > 0.85, "{}: {:?}", r.name, r.vector);
+                let at_16cm = r.vector.error_at_16cm_mm;
+                assert!((4.5..7.0).contains(&at_16cm), "{}: {at_16cm}", r.name);
                 assert!(field < 0.2 * vector, "{}: {field}", r.name);
                 assert!(noisy < 0.25 * vector, "{}: {noisy}", r.name);
                 assert_eq!(r.looks, LOOKS, "{}", r.name);

@@ -1,11 +1,8 @@
 //! The experiment on page and terminal.
 
-use super::{Shown, open_loop_mm, table::Table};
-use crate::experiment::{AtReference, Experiment, ExperimentPoint, Reference};
-use rover_page::{
-    BLUE, GREEN, ORANGE, PURPLE,
-    plot::{Marks, Plot, Series},
-};
+use super::{Shown, distance, table::Table};
+use crate::experiment::{AtReference, Experiment, Reference};
+use rover_page::{GREEN, ORANGE, PURPLE, escape};
 
 impl Shown for Experiment {
     const NAME: &'static str = "experiment";
@@ -16,7 +13,14 @@ impl Shown for Experiment {
     }
 
     fn lines(&self) -> String {
-        format!("{}{}", table(self).text(), sources(self).text())
+        format!(
+            "{}{}{}  {} {}\n",
+            of_mark(self).text(),
+            of_tip(self).text(),
+            sources(self).text(),
+            self.of_the_mark(),
+            self.of_the_tip()
+        )
     }
 
     fn section(&self) -> String {
@@ -26,66 +30,66 @@ impl Shown for Experiment {
              {} %, principal points by {} px (one sigma), the arm drooping under its own weight. \
              One stereo pair with the arm\u{2019}s mark at the reference place gives the vector. Each \
              target is a fiducial held there, found in a stereo pair; the arm\u{2019}s own mark is \
-             then sent to it and its true place measured (dots: purple without correction, blue with \
-             the vector; green: the tip with the field). Orange: the slope that the numeric study \
-             of locality predicts, from the same intercept. The paper states no numbers for its \
-             figure 7; it reports correction useful as far as 20 cm and a slope slightly steeper \
-             than predicted. Seed {}.</p><div class=\"charts\">{charts}</div>{}<p>{SOURCES}</p>{}",
+             then sent to it and its true place measured, as the paper\u{2019}s laser did (purple \
+             without correction, blue with the vector; green: the tip with the field). Orange: the \
+             slope that the numeric study of locality predicts, from the same value at no distance. \
+             Seed {}.</p><p>The paper states no number for its figure 7. It says: without correction \
+             \u{201c}essentially constant\u{201d}; with it a \u{201c}significant reduction\u{201d} as \
+             far as 20 cm, a linear trend, and a slope \u{201c}slightly steeper than the predicted \
+             theory\u{201d}.</p><div class=\"charts\">{charts}</div>{}<h3>At the place where the \
+             vector was taken</h3><p>{}</p>{}<p>{SOURCES}</p><h3>The instrument\u{2019}s tip</h3>\
+             <p>{}</p>{}",
             self.trials,
             self.intrinsics.0 * 100.0,
             self.intrinsics.1,
             self.seed,
-            table(self).html(),
-            sources(self).html()
+            of_mark(self).html(),
+            escape(&self.of_the_mark()),
+            sources(self).html(),
+            escape(&self.of_the_tip()),
+            of_tip(self).html(),
         )
     }
 }
 
-const SOURCES: &str = "What is left at the first place itself, mean over the robots, mm, with one \
-    thing at a time taken away. The mark\u{2019}s vector is taken with the mark there; the second \
-    one where the first brought it. \u{201c}9 cm away\u{201d}: the same with the tip at the place, \
-    so that the mark is seen a lever\u{2019}s length from where it is sent; the tip\u{2019}s error with \
-    that vector is the lever times the error of the last link\u{2019}s direction, which a single \
-    mark does not show.";
+const SOURCES: &str = "Means over the robots, mm, with one thing at a time taken away. The \
+    mark\u{2019}s vector is taken with the mark there, the second one where the first brought it; \
+    9 cm away: with the tip at the place.";
 
-fn table(study: &Experiment) -> Table<'_, Reference> {
-    Table::of(&study.references)
-        .column("vector taken at", |r| r.name.to_owned())
-        .column("open loop, mm", |r| {
-            open_loop_mm(r.points.iter().map(|p| p.open_loop_mm))
-        })
-        .column("slope, mm/m", |r| format!("{:.1}", r.slope_mm_per_m))
-        .column("predicted, mm/m", |r| {
+fn of_mark(study: &Experiment) -> Table<'_, Reference> {
+    distance::rows(&study.references)
+        .column("numeric study: slope, mm/m", |r| {
             format!("{:.1}", r.predicted_slope_mm_per_m)
         })
-        .column("exact sight, mm/m", |r| {
+        .column("from, mm", |r| format!("{:.2}", r.predicted_intercept_mm))
+        .column("slope with exact sight, mm/m", |r| {
             format!("{:.1}", r.exact_slope_mm_per_m)
-        })
-        .column("at the place, mm", |r| format!("{:.2}", r.at_reference_mm))
-        .column("intercept, mm", |r| format!("{:.2}", r.intercept_mm))
-        .column("predicted, mm", |r| {
-            format!("{:.2}", r.predicted_intercept_mm)
-        })
-        .column("r2", |r| format!("{:.3}", r.r2))
-        .column("at 16 cm, mm", |r| format!("{:.1}", r.error_at_16cm_mm))
-        .column("tip, mm/m", |r| format!("{:.1}", r.tip_slope_mm_per_m))
-        .column("from, mm", |r| format!("{:.1}", r.tip_intercept_mm))
-        .column("tip by plate, mm/m", |r| {
-            format!("{:.1}", r.plate_slope_mm_per_m)
-        })
-        .column("from, mm", |r| format!("{:.1}", r.plate_intercept_mm))
-        .column("tip by field, mm/m", |r| {
-            format!("{:.1}", r.field_slope_mm_per_m)
         })
         .column("robots x targets", |r| {
             format!("{} x {}", r.robots, r.points.len())
         })
 }
 
+fn of_tip(study: &Experiment) -> Table<'_, Reference> {
+    // A zero has no sign.
+    let mm = |x: f64| format!("{:.1}", if x.abs() < 0.05 { 0.0 } else { x });
+    Table::of(&study.references)
+        .column("tip, vector taken at", |r| r.name.to_owned())
+        .column("mark\u{2019}s vector: slope, mm/m", move |r| {
+            mm(r.tip_slope_mm_per_m)
+        })
+        .column("from, mm", move |r| mm(r.tip_intercept_mm))
+        .column("plate\u{2019}s pose: slope, mm/m", move |r| {
+            mm(r.plate_slope_mm_per_m)
+        })
+        .column("from, mm", move |r| mm(r.plate_intercept_mm))
+        .column("field: slope, mm/m", move |r| mm(r.field_slope_mm_per_m))
+}
+
 fn sources(study: &Experiment) -> Table<'_, AtReference> {
     let mm = |x: f64| format!("{x:.2}");
     Table::of(&study.at_reference)
-        .column("at the first place", |a| a.setting.to_owned())
+        .column("at the first place, mm", |a| a.setting.to_owned())
         .column("open loop", |a| format!("{:.1}", a.open_loop_mm))
         .column("mark", move |a| mm(a.mark_mm))
         .column("second vector", move |a| mm(a.mark_second_mm))
@@ -97,41 +101,11 @@ fn sources(study: &Experiment) -> Table<'_, AtReference> {
 
 /// One reference place as a plot.
 fn scatter(r: &Reference) -> String {
-    let points = |of: fn(&ExperimentPoint) -> f64| {
-        r.points
-            .iter()
-            .map(|p| (p.distance_m * 100.0, of(p)))
-            .collect()
-    };
-    let far = r.points.last().map_or(0.0, |p| p.distance_m);
-    let line = |slope: f64| {
-        let at = |x: f64| (x * 100.0, r.intercept_mm + slope * x);
-        vec![at(0.0), at(far)]
-    };
-    let series = |name, colour, points, marks| Series {
-        name,
-        colour,
-        points,
-        marks,
-    };
-    Plot {
-        title: r.name,
-        x_label: "distance from where the vector was taken, cm",
-        y_label: "mm",
-        whole_x: false,
-        from_zero: true,
-        series: vec![
-            series("none", PURPLE, points(|p| p.open_loop_mm), Marks::Dots),
-            series("one vector", BLUE, points(|p| p.error_mm), Marks::Dots),
-            series("its line", BLUE, line(r.slope_mm_per_m), Marks::Line),
-            series(
-                "predicted",
-                ORANGE,
-                line(r.predicted_slope_mm_per_m),
-                Marks::Line,
-            ),
-            series("tip, field", GREEN, points(|p| p.field_mm), Marks::Dots),
-        ],
-    }
-    .svg()
+    let predicted = (r.vector.intercept_mm, r.predicted_slope_mm_per_m);
+    let others = vec![
+        distance::dots(r, "none", PURPLE, |p| p.open_loop_mm),
+        distance::line(r, "predicted", ORANGE, predicted),
+        distance::dots(r, "tip, field", GREEN, |p| p.field_mm),
+    ];
+    distance::plot(r, others)
 }

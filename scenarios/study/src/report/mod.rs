@@ -3,26 +3,21 @@
 
 mod compare;
 mod cost;
+mod distance;
 mod experiment;
 mod locality;
+mod paper;
 mod sensitivity;
 mod table;
 mod table1;
 
 use super::{
     compare::Comparison, cost::Cost, experiment::Experiment, locality::Locality,
-    sensitivity::Sensitivity, statistics::mean, table1::Table1,
+    sensitivity::Sensitivity, table1::Table1,
 };
 use rover_page::{document, escape};
 use serde::Serialize;
 use std::fmt::Write;
-
-/// What cannot be known.
-const UNKNOWN: &str = "The paper published neither the arm's Denavit-Hartenberg table, nor the \
-    cameras' position, nor the targets or the parametrisation of the mount's rotation. Here: the \
-    flight arm of the Mars Exploration Rover with its 0.1306 m tool, cameras 0.3 m above the arm's \
-    base, targets that fill x 0.35 to 0.66, y \u{b1}0.34, z -0.33 to 0.57 m of the arm's base \
-    (z down), the mount's rotation as a rotation vector about the cameras' centre.";
 
 /// How one study is shown.
 trait Shown {
@@ -114,8 +109,14 @@ impl StudyReport {
         page.add(self.sensitivity.as_ref());
         page.add(self.compare.as_ref());
         page.add(self.cost.as_ref());
-        let unknown = format!("<p>{}</p>", escape(UNKNOWN));
-        page.put("unknown", "What a re-run cannot know", &unknown);
+        if self.together {
+            page.put(
+                "numbers",
+                "The paper\u{2019}s other numbers",
+                &paper::numbers(self),
+            );
+        }
+        page.put("unknown", "What a re-run cannot know", paper::UNKNOWN);
         let title = "The paper's analysis, carried out again";
         let body = format!(
             "<header><h1>{title}</h1><p class=\"lead\">Vision-based end-effector position error \
@@ -160,11 +161,6 @@ impl Page {
             "<section id=\"{id}\"><h2>{title}</h2>\n{content}\n</section>\n"
         );
     }
-}
-
-/// Mean of the open-loop errors of some targets, mm.
-fn open_loop_mm(of_targets: impl Iterator<Item = f64>) -> String {
-    format!("{:.1}", mean(&of_targets.collect::<Vec<_>>()))
 }
 
 /// A number of millimetres, or that too many trials failed.

@@ -1,18 +1,9 @@
 //! Sensitivity on page and terminal.
 
 use super::Shown;
-use crate::sensitivity::{ABOVE_M, Both, Row, Sensitivity};
+use crate::sensitivity::{ABOVE_M, COLUMNS, Sensitivity};
 use rover_page::{BLUE, GREEN, ORANGE, escape};
 use std::fmt::Write;
-
-/// The columns: heading and number.
-const COLUMNS: [(&str, fn(&Row) -> Both); 5] = [
-    ("before", |r| r.before),
-    ("mark at target", |r| r.mark),
-    ("mark 10 cm above", |r| r.mark_above),
-    ("plate at target", |r| r.plate),
-    ("plate 10 cm above", |r| r.plate_above),
-];
 
 impl Shown for Sensitivity {
     const NAME: &'static str = "sensitivity";
@@ -46,13 +37,13 @@ impl Shown for Sensitivity {
     fn section(&self) -> String {
         let head: String = COLUMNS
             .iter()
-            .map(|(heading, _)| format!("<th colspan=\"2\">{heading}</th>"))
+            .map(|(heading, _)| format!("<th class=\"group\" colspan=\"2\">{heading}</th>"))
             .collect();
         let mut rows = String::new();
         for r in &self.rows {
             let _ = write!(
                 rows,
-                "<tr><td class=\"text\">{}</td><td class=\"text note\">{}</td>",
+                "<tr><td class=\"text\" style=\"white-space:nowrap\">{}</td><td class=\"text note\">{}</td>",
                 r.name,
                 escape(&r.sigma)
             );
@@ -66,14 +57,15 @@ impl Shown for Sensitivity {
             }
             rows += "</tr>";
         }
-        let pair = "<th>Jacobians</th><th>simulated</th>".repeat(COLUMNS.len());
+        let pair = "<th>Jac.</th><th>sim.</th>".repeat(COLUMNS.len());
         format!(
             "<p>The Bluestreak testbed, {} targets, {} draws each, seed {}; one source at a time, \
              millimetres rms of the true tip from the true target. The vector is seen at the target \
              or {:.0} cm above it, as the position of one mark (the paper's fiducial) or as the \
-             pose of the plate. By Jacobians: the difference of the error's derivative at the target \
+             pose of the plate. By Jacobians (Jac.), the difference of the error's derivative at the target \
              and where it was seen, and, for arm and mount, the part that is quadratic in the \
-             errors. Bars, logarithmic: orange before, blue one mark, green the plate.</p>{}<div class=\"scroll\"><table><tr><th class=\"text\" rowspan=\"2\">source\
+             errors; beside it simulated (sim.). Bars, logarithmic, simulated: orange before, blue with one mark and green with the \
+             plate seen at the target; what is below a micrometre has no bar.</p>{}<div class=\"scroll\"><table><tr><th class=\"text\" rowspan=\"2\">source\
              </th><th class=\"text\" rowspan=\"2\">one sigma</th>{head}</tr><tr>{pair}</tr>{rows}\
              </table></div>",
             self.targets,
@@ -95,10 +87,10 @@ fn bars(study: &Sensitivity) -> String {
     let height = 40.0 + ROW * study.rows.len() as f64;
     let mut out = format!(
         "<svg class=\"plot\" style=\"max-width:46rem\" viewBox=\"0 0 {} {}\" role=\"img\">\
-         <text x=\"{LEFT}\" y=\"16\" class=\"title\">mm rms: before, one mark, plate at the target\
-         </text>",
+         <text x=\"{LEFT}\" y=\"16\" class=\"title\">error, mm rms</text>{}",
         LEFT + WIDTH + 20.0,
-        height + 24.0
+        height + 24.0,
+        key(LEFT + 120.0)
     );
     for power in -3..=2 {
         let x = at(10f64.powi(power));
@@ -132,4 +124,20 @@ fn bars(study: &Sensitivity) -> String {
         }
     }
     out + "</svg>"
+}
+
+/// What the colours of the bars are.
+fn key(left: f64) -> String {
+    let names = [("before", ORANGE), ("one mark", BLUE), ("plate", GREEN)];
+    let mut out = String::new();
+    for (i, (name, colour)) in names.into_iter().enumerate() {
+        let x = left + 95.0 * i as f64;
+        let _ = write!(
+            out,
+            "<rect x=\"{x}\" y=\"8\" width=\"12\" height=\"8\" fill=\"{colour}\"/>\
+             <text x=\"{}\" y=\"16\">{name}</text>",
+            x + 17.0
+        );
+    }
+    out
 }

@@ -16,55 +16,64 @@ impl Shown for Table1 {
     }
 
     fn lines(&self) -> String {
-        let trials: usize = self.rows.iter().map(|r| r.targets * r.trials).sum();
         format!(
-            "{}  {trials} trials in {:.1} ms on {} thread(s)\n",
+            "{}  {} trials in {:.1} ms on {}\n",
             table(self).text(),
+            self.trials(),
             self.compute_ms,
-            self.threads
+            threads(self.threads)
         )
     }
 
     fn section(&self) -> String {
-        let stages = |of: &dyn Fn(&Row) -> Vec<f64>, i: usize| -> Vec<(f64, f64)> {
-            let values = self.rows.get(i).map(of).unwrap_or_default();
-            values
-                .into_iter()
-                .enumerate()
-                .map(|(k, mm)| (k as f64, mm.log10()))
-                .collect()
-        };
         let ours = |r: &Row| vec![r.before_mm, r.after_mm, r.after_two_mm, r.after_three_mm];
         let paper = |r: &Row| vec![r.paper_before_mm, r.paper_after_mm];
-        let series = |name, colour, points, marks| Series {
-            name,
-            colour,
-            points,
-            marks,
+        let levels = [
+            ("0.5\u{b0} 1 mm", BLUE),
+            ("1\u{b0} 1 mm", ORANGE),
+            ("1\u{b0} 2.5 mm", GREEN),
+        ];
+        let series = |marks: Marks, stages: &dyn Fn(&Row) -> Vec<f64>| -> Vec<Series> {
+            let rows = self.rows.iter().zip(levels);
+            rows.map(|(row, (name, colour))| Series {
+                name: if marks == Marks::Rings { "" } else { name },
+                colour,
+                points: stages(row)
+                    .into_iter()
+                    .enumerate()
+                    .map(|(k, mm)| (k as f64, mm))
+                    .collect(),
+                marks,
+            })
+            .collect()
         };
+        let mut all = series(Marks::Joined, &ours);
+        all.extend(series(Marks::Rings, &paper));
         let plot = Plot {
-            title: "Mean error after so many corrections (line: here, dots: paper)",
+            title: "Mean error (rings: the paper)",
             x_label: "corrections",
-            y_label: "log10 mm",
+            y_label: "mm",
             whole_x: true,
             from_zero: false,
-            series: vec![
-                series("0.5\u{b0} 1 mm", BLUE, stages(&ours, 0), Marks::Line),
-                series("1\u{b0} 1 mm", ORANGE, stages(&ours, 1), Marks::Line),
-                series("1\u{b0} 2.5 mm", GREEN, stages(&ours, 2), Marks::Line),
-                series("", BLUE, stages(&paper, 0), Marks::Dots),
-                series("", ORANGE, stages(&paper, 1), Marks::Dots),
-                series("", GREEN, stages(&paper, 2), Marks::Dots),
-            ],
+            series: all,
         };
         format!(
-            "<div class=\"charts\">{}</div>{}<p>Computed in {:.1} ms on {} thread(s), seed {}.</p>",
-            plot.svg(),
+            "<div class=\"charts\">{}</div>{}<p>The paper stops after one correction. All {} trials \
+             computed in {:.1} ms on {}, seed {}.</p>",
+            plot.svg_in_decades(),
             table(self).html(),
+            self.trials(),
             self.compute_ms,
-            self.threads,
+            threads(self.threads),
             self.seed
         )
+    }
+}
+
+fn threads(count: usize) -> String {
+    match count {
+        1 => "one thread".to_owned(),
+        n => format!("{n} threads"),
     }
 }
 
@@ -78,8 +87,8 @@ fn table(study: &Table1) -> Table<'_, Row> {
         .column("after: paper, mm", |r| format!("{:.1}", r.paper_after_mm))
         .column("here, mm", |r| format!("{:.2}", r.after_mm))
         .column("here, 95 %, mm", |r| format!("{:.2}", r.after_p95_mm))
-        .column("second, mm", |r| format!("{:.3}", r.after_two_mm))
-        .column("third, mm", |r| format!("{:.4}", r.after_three_mm))
+        .column("after two, mm", |r| format!("{:.3}", r.after_two_mm))
+        .column("after three, mm", |r| format!("{:.4}", r.after_three_mm))
         .column("targets x draws", |r| {
             format!("{} x {}", r.targets, r.trials)
         })

@@ -9,6 +9,7 @@
 
 mod analytic;
 mod simulated;
+mod verdict;
 
 use super::{StudyConfig, StudyError, testbed::Testbed};
 use nalgebra::{Unit, Vector3};
@@ -43,6 +44,15 @@ const MATCH_PX: f64 = 0.3;
 const TILT_RAD: f64 = 0.05 * std::f64::consts::PI / 180.0;
 /// Numbers by which one camera's model is wrong: focal length, principal point u and v, lens.
 const PER_CAMERA: usize = 5;
+
+/// The columns: heading and number.
+pub(crate) const COLUMNS: [(&str, fn(&Row) -> Both); 5] = [
+    ("before", |r| r.before),
+    ("mark at target", |r| r.mark),
+    ("mark 10 cm above", |r| r.mark_above),
+    ("plate at target", |r| r.plate),
+    ("plate 10 cm above", |r| r.plate_above),
+];
 
 /// A source of error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -105,7 +115,7 @@ impl Source {
             Self::Match => ("match of the target", format!("{MATCH_PX} px")),
             Self::Droop => ("droop, all of it", "not modelled".into()),
             Self::BodyTilt => ("tilt of the body", deg(TILT_RAD)),
-            Self::All => ("all together", String::new()),
+            Self::All => ("all together", "all of these".into()),
         }
     }
 
@@ -371,64 +381,6 @@ impl Sensitivity {
     fn row(&self, source: Source) -> Option<&Row> {
         self.rows.iter().find(|r| r.source == source)
     }
-
-    /// What the study says, from its own numbers.
-    pub fn verdict(&self) -> String {
-        let simulated = |source: Source, of: fn(&Row) -> Both| {
-            self.row(source).map_or(f64::NAN, |r| of(r).simulated_mm)
-        };
-        let largest = |of: fn(&Row) -> Both| {
-            let single = self.rows.iter().filter(|r| r.source != Source::All);
-            single
-                .max_by(|a, b| of(a).simulated_mm.total_cmp(&of(b).simulated_mm))
-                .map_or("none", |r| r.name)
-        };
-        let mut worst: f64 = 1.0;
-        for r in &self.rows {
-            for b in [r.before, r.mark, r.mark_above, r.plate, r.plate_above] {
-                if b.simulated_mm > 0.05 {
-                    let ratio = b.analytic_mm / b.simulated_mm;
-                    worst = worst.max(ratio).max(1.0 / ratio);
-                }
-            }
-        }
-        let plate_loses =
-            simulated(Source::Intrinsics, |r| r.plate) > simulated(Source::Intrinsics, |r| r.mark);
-        let range = if plate_loses {
-            "; its range comes from the plate's size, too, so that what is wrong with the cameras \
-             is no longer the same for target and fiducial, which is what makes the paper's vector \
-             forgive bad cameras"
-        } else {
-            ""
-        };
-        format!(
-            "Without correction {:.1} mm rms, most of it from {}. One vector of one mark, seen at \
-             the target, removes what arm lengths and mount translation do; of arm angles and \
-             mount rotation it leaves {:.1} and {:.1} mm, because the error of the tool's \
-             direction acts over the lever between mark and tip. The pose of the plate leaves \
-             {:.2} and {:.2} mm of these. Wrong intrinsics leave {:.1} mm with the mark and {:.1} \
-             mm with the plate{range}. Two sources no vector corrects: the match of the target \
-             ({:.1} mm, mostly in range) and a tilt of the body that carries arm and cameras \
-             ({:.1} mm). All together: {:.1} mm with the mark and {:.1} mm with the plate at the \
-             target, {:.1} and {:.1} mm when seen 10 cm above it. Jacobians and simulation agree \
-             within {:.0} % wherever more than 0.05 mm is left.",
-            simulated(Source::All, |r| r.before),
-            largest(|r| r.before),
-            simulated(Source::ArmAngles, |r| r.mark),
-            simulated(Source::MountRotation, |r| r.mark),
-            simulated(Source::ArmAngles, |r| r.plate),
-            simulated(Source::MountRotation, |r| r.plate),
-            simulated(Source::Intrinsics, |r| r.mark),
-            simulated(Source::Intrinsics, |r| r.plate),
-            simulated(Source::Match, |r| r.plate),
-            simulated(Source::BodyTilt, |r| r.plate),
-            simulated(Source::All, |r| r.mark),
-            simulated(Source::All, |r| r.plate),
-            simulated(Source::All, |r| r.mark_above),
-            simulated(Source::All, |r| r.plate_above),
-            (worst - 1.0) * 100.0
-        )
-    }
 }
 
 #[cfg(test)]
@@ -442,15 +394,13 @@ mod tests {
         assert_eq!(study.rows.len(), Source::ALL.len());
         assert!(study.targets >= 12, "{} targets", study.targets);
         for r in &study.rows {
-            for (i, b) in [r.before, r.mark, r.mark_above, r.plate, r.plate_above]
-                .into_iter()
-                .enumerate()
-            {
+            for (column, of) in COLUMNS {
+                let b = of(r);
                 let (a, s) = (b.analytic_mm, b.simulated_mm);
                 // A few hundred draws scatter by some per cent; where nothing is left in first
                 // order and little in second, only the size is asked for.
                 let close = (a - s).abs() < 0.15 * s.max(a) + 0.02;
-                assert!(close, "{} column {i}: {a} against {s} mm", r.name);
+                assert!(close, "{}, {column}: {a} against {s} mm", r.name);
             }
         }
     }
