@@ -297,3 +297,17 @@ fn a_picture_of_other_ground_tells_no_motion() {
     let hidden = egomotion([&last, &now], &marks, &odometry, |_, _| false, &rules).unwrap_err();
     assert_eq!(hidden.shown_n, 0);
 }
+
+#[test]
+fn other_ground_is_not_taken_for_the_target_where_the_motion_is_known() {
+    for seed in 2..8 {
+        let (mut tracker, start) = designated(1);
+        let now = pose(0.7, 0.02);
+        let (cameras, _) = mast(&now);
+        let view = view(&cameras, &now, seed);
+        let motion = now.inverse() * start;
+        let spread = Matrix2::identity() * 4.0;
+        let refused = tracker.update(&view, &motion, &spread, false);
+        assert!(refused.is_err(), "seed {seed}: {refused:?}");
+    }
+}

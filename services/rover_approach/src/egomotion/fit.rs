@@ -222,10 +222,12 @@ mod tests {
     fn the_motion_is_that_of_the_many_in_spite_of_mistaken_ones() {
         let off = Correction(Vector6::new(0.03, -0.008, 0.004, 0.004, -0.003, 0.03));
         let found = landmarks(&off);
-        let fit = Fit::of(&found, &camera(), &prior(), None, 6.0).unwrap();
+        let loose = prior() * 25.0;
+        let fit = Fit::of(&found, &camera(), &loose, None, 6.0).unwrap();
         let at = |c: &Correction| (c.isometry() * Point3::new(3.5, 0.2, 0.1)).coords;
-        assert!(fit.agreeing_n * 4 >= found.len() * 3, "{}", fit.agreeing_n);
-        let fine = Fit::of(&found, &camera(), &prior(), Some(fit.correction), 2.0).unwrap();
+        let right = found.len() - found.len().div_ceil(4);
+        assert!(fit.agreeing_n >= right, "{}", fit.agreeing_n);
+        let fine = Fit::of(&found, &camera(), &loose, Some(fit.correction), 2.0).unwrap();
         // odometry pulls a little
         let rest = (at(&fine.correction) - at(&off)).norm();
         assert!(rest < 0.002, "{rest} m, {} px", fine.rms_px);
