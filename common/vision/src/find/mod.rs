@@ -44,6 +44,7 @@ use crate::fiducial::NotFound;
 use crate::harris::{HarrisRules, harris_corners};
 use crate::image::{Image8, ImageError};
 use crate::ncc::Window;
+pub(crate) use pixels::noise_dn;
 
 /// One fiducial seen in an image.
 #[derive(Clone, Debug, PartialEq)]

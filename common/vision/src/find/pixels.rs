@@ -201,7 +201,7 @@ const NOISE_MARGIN_PX: u32 = 16;
 /// difference in u of the second difference in v, which smooth shading and straight edges along
 /// the pixels do not change (mask of J. Immerkaer, "Fast noise variance estimation", 1996). Clipped
 /// pixels are left out.
-pub(super) fn noise_dn(image: &Image8, window: Window) -> f64 {
+pub(crate) fn noise_dn(image: &Image8, window: Window) -> f64 {
     let m = NOISE_MARGIN_PX;
     let wide = Window {
         left: window.left.saturating_sub(m),
