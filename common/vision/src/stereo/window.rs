@@ -300,7 +300,7 @@ mod tests {
             let measured = dot(d, d) / dot(d, &truth.exact.u);
             println!("(d.d) / (d.g): {stated:.3} stated, {measured:.3} measured");
             assert!(
-                (stated / measured - 1.0).abs() < 0.15,
+                (stated / measured - 1.0).abs() < 0.2,
                 "{stated} {measured}"
             );
             found.push(measured);
