@@ -15,6 +15,7 @@
 
 mod blobs;
 mod disc;
+mod disc_centre;
 mod edges;
 mod homography;
 mod pixels;
@@ -27,7 +28,8 @@ mod template;
 mod tests;
 mod warp;
 
-pub use disc::{DiscRules, DiscTruth, Polarity, disc};
+pub use disc::{DiscRules, Polarity, disc};
+pub use disc_centre::DiscTruth;
 pub use plate::plate;
 pub use saddle::{SaddleRules, saddle};
 pub use tag_code::TAG_FAMILIES;
@@ -42,6 +44,7 @@ use crate::fiducial::NotFound;
 use crate::harris::{HarrisRules, harris_corners};
 use crate::image::{Image8, ImageError};
 use crate::ncc::Window;
+pub(crate) use pixels::noise_dn;
 
 /// One fiducial seen in an image.
 #[derive(Clone, Debug, PartialEq)]

@@ -23,6 +23,9 @@ pub(super) trait PixelModel<const N: usize> {
     const DEFORMATIONS: usize;
     /// Deformation that is granted (print, lens, sensor, the model's own approximations), px.
     const GRANTED_PX: f64;
+    /// A shape passes with deformations up to this multiple of what noise and the granted
+    /// deformation explain, root mean square.
+    const MAX_DEFORMATION: f64;
 
     /// What deformations by one pixel each would add to the value at a pixel; `out` is zero.
     fn deform(&self, p: &[f64; N], u: f64, v: f64, out: &mut [f64]);
@@ -82,9 +85,17 @@ macro_rules! fit_rules {
 }
 pub(super) use fit_rules;
 
-/// A shape passes with deformations up to this multiple of what noise and the granted deformation
-/// explain: with a dozen deformations the shape itself exceeds it once in some ten thousand.
-const MAX_DEFORMATION: f64 = 1.8;
+impl FitRules {
+    /// Largest rms difference between model and image, DN, for the image's own noise and so many
+    /// pixels.
+    pub fn residual_limit_dn(&self, noise_dn: f64, contrast_dn: f64, freedom: f64) -> f64 {
+        let noise_dn = noise_dn.min(self.noise_dn).max(QUANTISATION_DN);
+        // the variance of a mean of n squares of noise is 2 / n
+        let chance = 1.0 + RESIDUAL_SIGMAS * (2.0 / freedom).sqrt();
+        let misfit_dn = self.max_residual_fraction * contrast_dn;
+        (noise_dn * noise_dn * chance + misfit_dn * misfit_dn).sqrt()
+    }
+}
 
 impl<const N: usize> PixelFit<N> {
     /// The standard deviation to state, px, if contrast, blur (the last parameter), score, residual,
@@ -117,11 +128,7 @@ impl<const N: usize> PixelFit<N> {
                 limit: rules.min_score,
             });
         }
-        let noise_dn = noise_dn.min(rules.noise_dn).max(QUANTISATION_DN);
-        // the variance of a mean of n squares of noise is 2 / n
-        let chance = 1.0 + RESIDUAL_SIGMAS * (2.0 / self.freedom).sqrt();
-        let misfit_dn = rules.max_residual_fraction * contrast_dn;
-        let limit_dn = (noise_dn * noise_dn * chance + misfit_dn * misfit_dn).sqrt();
+        let limit_dn = rules.residual_limit_dn(noise_dn, contrast_dn, self.freedom);
         if !(self.rms_dn <= limit_dn) {
             return Err(NoFinding::Misfit {
                 rms_dn: self.rms_dn,
@@ -142,12 +149,13 @@ impl<const N: usize> PixelFit<N> {
                 limit_px: rules.max_sigma_px,
             });
         }
+        let noise_dn = noise_dn.min(rules.noise_dn).max(QUANTISATION_DN);
         let deformation = self.deformation(image, model, noise_dn)?;
-        if !(deformation <= MAX_DEFORMATION) {
+        if !(deformation <= M::MAX_DEFORMATION) {
             return Err(NoFinding::Shape {
                 what: "deformation over what noise explains",
                 found: deformation,
-                expected: format!("at most {MAX_DEFORMATION}"),
+                expected: format!("at most {}", M::MAX_DEFORMATION),
             });
         }
         Ok(sigma_px)
@@ -193,7 +201,7 @@ const NOISE_MARGIN_PX: u32 = 16;
 /// difference in u of the second difference in v, which smooth shading and straight edges along
 /// the pixels do not change (mask of J. Immerkaer, "Fast noise variance estimation", 1996). Clipped
 /// pixels are left out.
-pub(super) fn noise_dn(image: &Image8, window: Window) -> f64 {
+pub(crate) fn noise_dn(image: &Image8, window: Window) -> f64 {
     let m = NOISE_MARGIN_PX;
     let wide = Window {
         left: window.left.saturating_sub(m),

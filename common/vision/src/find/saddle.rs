@@ -139,6 +139,8 @@ impl PixelModel<5> for Crossing {
     /// the contrast); a gap or a neck at the crossing.
     const DEFORMATIONS: usize = 12;
     const GRANTED_PX: f64 = 0.12;
+    /// With a dozen deformations a crossing itself exceeds this once in some ten thousand.
+    const MAX_DEFORMATION: f64 = 1.8;
 
     fn deform(&self, p: &[f64; 5], u: f64, v: f64, out: &mut [f64]) {
         let (du, dv) = (u - p[0], v - p[1]);

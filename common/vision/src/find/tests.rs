@@ -392,6 +392,43 @@ fn nothing_is_found_where_nothing_is() {
     }
 }
 
+/// A blurred black ellipse on white, its outline moved by `bulge_px` cos 3 t; beside it a bar whose
+/// edge is `gap_px` from the ellipse's.
+fn outlined(axes: [f64; 2], bulge_px: f64, gap_px: f64) -> Image8 {
+    let pixels = (0..64 * 64)
+        .map(|i| {
+            let sum: f64 = (0..64)
+                .map(|k| {
+                    let u = f64::from(i % 64) - 31.3 + (f64::from(k % 8) - 3.5) / 8.0;
+                    let v = f64::from(i / 64) - 32.2 + (f64::from(k / 8) - 3.5) / 8.0;
+                    let angle = (v / axes[1]).atan2(u / axes[0]);
+                    let edge = (u / axes[0]).hypot(v / axes[1]) - 1.0;
+                    let distance = edge * axes[0] - bulge_px * (3.0 * angle).cos();
+                    let bar = u - axes[0] - gap_px;
+                    let shade = |x: f64| 1.0 / (1.0 + (-2.2 * x).exp());
+                    30.0 + 160.0 * shade(distance) * shade(-bar)
+                })
+                .sum();
+            (sum / 64.0).round() as u8
+        })
+        .collect();
+    Image8::from_raw(64, 64, pixels).unwrap()
+}
+
+#[test]
+fn a_disc_is_round_large_enough_and_alone() {
+    let rules = DiscRules::default();
+    let found = |image: &Image8| disc(image, Window::whole(image), &rules, None);
+    assert!(found(&outlined([8.0, 7.0], 0.0, 20.0)).is_ok());
+    let bulging = found(&outlined([8.0, 7.0], 0.4, 20.0)).unwrap_err();
+    assert!(["shape", "misfit"].contains(&bulging.rule()), "{bulging}");
+    let small = found(&outlined([4.0, 3.9], 0.0, 20.0)).unwrap_err();
+    assert_eq!(small.rule(), "too_small", "{small}");
+    // clear of the fitted margin, within the quiet zone
+    let crowded = found(&outlined([8.0, 7.0], 0.0, 4.4)).unwrap_err();
+    assert!(crowded.to_string().contains("unevenness"), "{crowded}");
+}
+
 #[test]
 fn refusals_name_their_rule() {
     let flat = Image8::from_raw(64, 64, vec![100; 64 * 64]).unwrap();

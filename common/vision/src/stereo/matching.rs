@@ -5,7 +5,8 @@ use rover_cameras::{Camera, CameraError, StereoPair};
 
 use super::coarse::{self, CoarseMatch, Warp};
 use super::link::Link;
-use super::refine::{Displacement, LeftWindow, Refined, refine};
+use super::refine::{Displacement, Refined, refine};
+use super::window::LeftWindow;
 use super::{MatchRules, PreparedImage};
 
 /// The same surface point in both images.
@@ -216,7 +217,7 @@ pub(super) fn match_checked(
     let mut fits: Vec<(Link, Refined)> = Vec::new();
     let mut failure = None;
     for candidate in candidates.iter().filter(|c| c.score >= top - CANDIDATE_GAP) {
-        match fit(cameras, right, left_px, &window, candidate, rules) {
+        match fit(cameras, (left, right), left_px, &window, candidate, rules) {
             Ok(found) => fits.push(found),
             Err(e) => {
                 failure.get_or_insert(e);
@@ -230,7 +231,14 @@ pub(super) fn match_checked(
             limit: rules.min_score,
         }));
     };
-    let found = accept(link, best, left_px, rules)?;
+    let wide = widened(link, best, (left, right), left_px, rules);
+    let found = accept(
+        link,
+        wide.as_ref().unwrap_or(best),
+        (left, right),
+        left_px,
+        rules,
+    )?;
     let elsewhere = fits[1..].iter().find(|(link, fit)| {
         let at = link.at + link.along * fit.displacement.along_px;
         (at - found.right_px).norm() > SAME_PLACE_PX
@@ -248,10 +256,10 @@ pub(super) fn match_checked(
     Ok(found)
 }
 
-/// Fits one candidate of the search.
+/// Fits one candidate of the search; where noise keeps the window from settling, the widest one.
 fn fit(
     (a, b): (&Camera, &Camera),
-    right: &PreparedImage,
+    (left, right): (&PreparedImage, &PreparedImage),
     left_px: &Vector2<f64>,
     window: &LeftWindow,
     candidate: &CoarseMatch,
@@ -266,22 +274,89 @@ fn fit(
         slopes: slopes.unwrap_or_else(Vector2::zeros),
         across_px: 0.0,
     };
-    let refined = refine(window, right, &link, start, rules)?;
+    let unsettled = match refine(window, right, &link, start, rules) {
+        Err(e @ (MatchFailure::Diverged { .. } | MatchFailure::TooSteep { .. })) => e,
+        done => return Ok((link, done?)),
+    };
+    let widest = rules.max_half_window_px as usize;
+    if widest <= window.half || window.signal_part(left.noise_dn().powi(2)) > LITTLE_NOISE {
+        return Err(unsettled);
+    }
+    let wide = LeftWindow::new(left, left_px, widest).ok_or(unsettled)?;
+    let refined = refine(&wide, right, &link, start, rules)?;
     Ok((link, refined))
+}
+
+/// Windows are not held back by noise if this part of their variance is signal.
+const LITTLE_NOISE: f64 = 0.97;
+/// A wider window agrees within so many standard deviations of the difference, and px.
+const AGREEMENT_SIGMAS: f64 = 3.0;
+const AGREEMENT_PX: f64 = 0.02;
+/// Residual of the wider window over the smaller one's, whose own is known to a twentieth.
+const MAX_RESIDUAL_RATIO: f64 = 1.15;
+
+/// The same fit over a window large enough for the aimed certainty, if the surface allows it.
+fn widened(
+    link: &Link,
+    narrow: &Refined,
+    (left, right): (&PreparedImage, &PreparedImage),
+    left_px: &Vector2<f64>,
+    rules: &MatchRules,
+) -> Option<Refined> {
+    let (aim, most) = (rules.aim_sigma_px, f64::from(rules.max_half_window_px));
+    if !(narrow.sigma_px > aim && rules.max_half_window_px > rules.half_window_px) {
+        return None;
+    }
+    let side = 2.0 * f64::from(rules.half_window_px) + 1.0;
+    // the deviation falls as the side grows
+    let half = (0.5 * (side * narrow.sigma_px / aim - 1.0))
+        .ceil()
+        .min(most);
+    let window = LeftWindow::new(left, left_px, half as usize)?;
+    let wide = refine(&window, right, link, narrow.displacement, rules).ok()?;
+    let off = wide.displacement.along_px - narrow.displacement.along_px;
+    // the smaller window is part of the wider one: of the difference, the variances differ
+    let variance = (narrow.sigma_px.powi(2) - wide.sigma_px.powi(2)).max(0.0);
+    let agrees = off.abs() <= AGREEMENT_SIGMAS * variance.sqrt() + AGREEMENT_PX;
+    let fits = wide.residual_dn <= MAX_RESIDUAL_RATIO * narrow.residual_dn;
+    (agrees && fits && wide.sigma_px < narrow.sigma_px).then_some(wide)
+}
+
+/// Noise is never held responsible for more than this part of a window's variance.
+const MOST_NOISE: f64 = 0.6;
+
+/// The NCC that windows with these deviations must reach: the rules' for windows without noise, less
+/// what the images' noise takes off it, but no less than in the search.
+fn least_score(
+    deviations_dn: [f64; 2],
+    (left, right): (&PreparedImage, &PreparedImage),
+    rules: &MatchRules,
+) -> f64 {
+    let part = |deviation: f64, noise: f64| {
+        1.0 - (noise * noise / (deviation * deviation).max(1e-9)).min(MOST_NOISE)
+    };
+    let left = part(deviations_dn[0], left.noise_dn());
+    let right = part(deviations_dn[1], right.noise_dn());
+    (rules.min_score * (left * right).sqrt()).max(rules.min_search_score.min(rules.min_score))
 }
 
 /// Turns a fit into a match if it passes the checks on score, sigma, range and epipolar distance.
 pub(super) fn accept(
     link: &Link,
     fit: &Refined,
+    images: (&PreparedImage, &PreparedImage),
     left_px: &Vector2<f64>,
     rules: &MatchRules,
 ) -> Result<StereoMatch, MatchFailure> {
+    // only what would be refused asks for the noise
     if !(fit.score >= rules.min_score) {
-        return Err(MatchFailure::LowScore {
-            score: fit.score,
-            limit: rules.min_score,
-        });
+        let limit = least_score(fit.deviations_dn, images, rules);
+        if !(fit.score >= limit) {
+            return Err(MatchFailure::LowScore {
+                score: fit.score,
+                limit,
+            });
+        }
     }
     let d = &fit.displacement;
     if d.across_px.abs() > rules.max_epipolar_px {

@@ -20,6 +20,7 @@ mod rules;
 mod sparse;
 mod surface;
 mod surface_fit;
+mod window;
 
 pub use dense::{DenseError, DenseRules, Disparity, dense_disparity};
 pub use dense_export::PairDisparityError;
@@ -32,8 +33,11 @@ pub use rules::{MatchRules, SurfaceRules};
 pub use sparse::sparse_points;
 pub use surface::{Surface, SurfaceFailure, measure_surface};
 
+use std::sync::OnceLock;
+
+use crate::find::noise_dn;
 use crate::image::{Image8, ImageError, ImageF};
-use crate::ncc::SearchImage;
+use crate::ncc::{SearchImage, Window};
 use crate::sample::{Sample, SplineImage};
 
 /// An image prepared for matching: make it once per image, use it for any number of matches.
@@ -43,7 +47,13 @@ pub struct PreparedImage {
     height_px: u32,
     grey: SearchImage,
     spline: SplineImage,
+    /// Standard deviation of the grey noise, DN; measured when first asked for.
+    noise_dn: OnceLock<f64>,
 }
+
+/// Tiles that the noise is measured in, and their distance, px.
+const NOISE_TILE_PX: u32 = 32;
+const NOISE_STEP_PX: usize = 96;
 
 impl PreparedImage {
     /// Prepares an image (about a millisecond for 640 x 480).
@@ -57,6 +67,35 @@ impl PreparedImage {
             height_px: image.height_px,
             grey: SearchImage::whole(image, 0),
             spline: SplineImage::new(&working),
+            noise_dn: OnceLock::new(),
+        })
+    }
+
+    /// Standard deviation of the grey noise, DN: the lower quartile over tiles of the image, since
+    /// fine texture looks like noise.
+    fn noise_dn(&self) -> f64 {
+        *self.noise_dn.get_or_init(|| {
+            let rows = 0..self.height_px as usize;
+            let pixels = rows.flat_map(|v| self.grey.values(v).iter());
+            let pixels = pixels.map(|&held| SearchImage::grey(held).round() as u8);
+            let Ok(image) = Image8::from_raw(self.width_px, self.height_px, pixels.collect())
+            else {
+                return 0.0;
+            };
+            let mut found = Vec::new();
+            for top in (0..self.height_px).step_by(NOISE_STEP_PX) {
+                for left in (0..self.width_px).step_by(NOISE_STEP_PX) {
+                    let tile = Window {
+                        left,
+                        top,
+                        width: NOISE_TILE_PX,
+                        height: NOISE_TILE_PX,
+                    };
+                    found.push(noise_dn(&image, tile.clipped(&image)));
+                }
+            }
+            found.sort_by(f64::total_cmp);
+            found.get(found.len() / 4).copied().unwrap_or(0.0)
         })
     }
 

@@ -3,13 +3,15 @@
 //! Model: right(W(d)) = alpha left(d) + beta, W(d) = at + base d + along (p0 + p1 du + p2 dv) +
 //! across q. Derivatives come from the left window's gradient, taken once, so that their noise is
 //! independent of the resampled right window and the estimate has no noise-induced bias (inverse
-//! compositional idea of Baker and Matthews, with additive updates).
+//! compositional idea of Baker and Matthews, with additive updates). What their noise does to steps
+//! and to the stated deviation is put right, and where it is large they are smoothed, see
+//! [`LeftWindow`]; the noise is read from the residual.
 
 use nalgebra::{SMatrix, SVector, Vector2};
 
 use super::link::Link;
+use super::window::{Gradients, LeftWindow, dot};
 use super::{MatchFailure, MatchRules, PreparedImage};
-use crate::ncc::SearchImage;
 
 /// Where a fit starts and what it ends with, relative to a [`Link`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -30,6 +32,10 @@ pub(super) struct Refined {
     pub score: f64,
     /// Standard deviation of `along_px`, px.
     pub sigma_px: f64,
+    /// Root mean square difference between the windows, DN of the right image.
+    pub residual_dn: f64,
+    /// Standard deviations of the left and the right window, DN.
+    pub deviations_dn: [f64; 2],
 }
 
 const MAX_STEPS: usize = 20;
@@ -41,108 +47,32 @@ const SETTLED_PX: f64 = 0.002;
 const RELINEARISE_SLOPE: f64 = 0.03;
 /// Grey noise assumed when the offset across the curve is held, DN.
 const ASSUMED_NOISE_DN: f64 = 2.0;
+/// Steps after which the residual tells the noise.
+const FIRST_STEPS: usize = 2;
+/// Derivatives that promise this much more than they hold are smoothed if that helps.
+const NOISY: f64 = 1.1;
 /// Least gain between the windows.
 const MIN_GAIN: f64 = 0.2;
 
-/// The left window: values and gradients at whole pixels around a pixel, in rows padded with
-/// zeros to whole vectors.
-pub(super) struct LeftWindow {
-    half: usize,
-    side: usize,
-    stride: usize,
-    /// Offset of the first window pixel from the exact pixel.
-    first: Vector2<f64>,
-    /// Values less their mean.
-    values: Vec<f32>,
-    gradient_u: Vec<f32>,
-    gradient_v: Vec<f32>,
-    /// 1 in the window, 0 in the padding.
-    ones: Vec<f32>,
-    mean: f32,
-    /// Sum of the squares of `values`.
-    square: f64,
-    /// Standard deviation, DN.
-    pub deviation_dn: f64,
-}
-
-impl LeftWindow {
-    /// The window of half side `half` around `pixel`; `None` if it leaves the image.
-    pub fn new(image: &PreparedImage, pixel: &Vector2<f64>, half: usize) -> Option<Self> {
-        let (cu, cv) = (pixel.x.round(), pixel.y.round());
-        let room = half as f64 + 1.0;
-        let fits = |x: f64, size: u32| x >= room && x + room <= f64::from(size) - 1.0;
-        if !(fits(cu, image.width_px) && fits(cv, image.height_px)) {
-            return None;
-        }
-        let side = 2 * half + 1;
-        let stride = side.div_ceil(LANES) * LANES;
-        let (u0, v0) = (cu as usize - half, cv as usize - half);
-        let plane = || vec![0.0f32; stride * side];
-        let (mut values, mut ones, mut gradient_u, mut gradient_v) =
-            (plane(), plane(), plane(), plane());
-        let mut sum = 0.0;
-        for j in 0..side {
-            let at = j * stride..j * stride + side;
-            let row = &image.grey.values(v0 + j)[u0..u0 + side];
-            for (x, &held) in values[at.clone()].iter_mut().zip(row) {
-                *x = SearchImage::grey(held);
-                sum += f64::from(*x);
-            }
-            ones[at.clone()].fill(1.0);
-            image
-                .spline
-                .gradient_row(u0, v0 + j, &mut gradient_u[at.clone()], &mut gradient_v[at]);
-        }
-        let n = (side * side) as f64;
-        let mean = (sum / n) as f32;
-        for (x, one) in values.iter_mut().zip(&ones) {
-            *x -= mean * one;
-        }
-        let square = dot(&values, &values);
-        Some(Self {
-            half,
-            side,
-            stride,
-            first: Vector2::new(u0 as f64 - pixel.x, v0 as f64 - pixel.y),
-            values,
-            gradient_u,
-            gradient_v,
-            ones,
-            mean,
-            square,
-            deviation_dn: (square / n).sqrt(),
-        })
-    }
-}
-
 type Normal = SMatrix<f64, 6, 6>;
-
-/// Number of partial sums in [`dot`].
-const LANES: usize = 8;
-
-/// Dot product with a fixed order of summation. Lengths are equal multiples of [`LANES`].
-#[inline(always)]
-fn dot(a: &[f32], b: &[f32]) -> f64 {
-    let mut sums = [0.0f32; LANES];
-    for (a, b) in a.chunks_exact(LANES).zip(b.chunks_exact(LANES)) {
-        for ((s, x), y) in sums.iter_mut().zip(a).zip(b) {
-            *s += x * y;
-        }
-    }
-    f64::from(
-        ((sums[0] + sums[4]) + (sums[1] + sums[5])) + ((sums[2] + sums[6]) + (sums[3] + sums[7])),
-    )
-}
 
 /// Derivatives by the four geometric parameters, one padded plane each, and the normal matrix.
 struct Derivatives {
     slopes: Vector2<f64>,
+    /// The epipolar direction in the left image.
+    along: Vector2<f64>,
     planes: [Vec<f32>; 4],
     factor: nalgebra::linalg::Cholesky<f64, nalgebra::Const<6>>,
 }
 
 impl Derivatives {
-    fn new(window: &LeftWindow, link: &Link, slopes: Vector2<f64>, hold: f64) -> Option<Self> {
+    fn new(
+        window: &LeftWindow,
+        gradients: &Gradients,
+        link: &Link,
+        slopes: Vector2<f64>,
+        hold: f64,
+    ) -> Option<Self> {
         // gradient in the right image = A^-T gradient in the left one
         let inverse = link.matrix(&slopes).try_inverse()?;
         let (along, across) = (inverse * link.along, inverse * link.across);
@@ -161,7 +91,7 @@ impl Derivatives {
             let dv = fv + j as f32 * scale;
             for i in 0..window.side {
                 let at = j * window.stride + i;
-                let (gu, gv) = (window.gradient_u[at], window.gradient_v[at]);
+                let (gu, gv) = (gradients.u[at], gradients.v[at]);
                 let e = au * gu + av * gv;
                 planes[0][at] = e;
                 planes[1][at] = e * (fu + i as f32 * scale);
@@ -191,6 +121,7 @@ impl Derivatives {
         }
         Some(Self {
             slopes,
+            along,
             planes,
             factor: normal.cholesky()?,
         })
@@ -215,7 +146,12 @@ pub(super) fn refine(
     let mut now = start;
     let mut samples = vec![0.0f32; count];
     let mut padded = vec![0.0f32; window.values.len()];
-    let mut derivatives = Derivatives::new(window, link, now.slopes, hold).ok_or_else(singular)?;
+    let mut quieter: Option<Gradients> = None;
+    let mut is_noise_settled = false;
+    let linearised = |gradients: &Gradients, slopes: Vector2<f64>| {
+        Derivatives::new(window, gradients, link, slopes, hold).ok_or_else(singular)
+    };
+    let mut derivatives = linearised(&window.exact, now.slopes)?;
     for taken in 0..MAX_STEPS {
         let matrix = link.matrix(&now.slopes);
         let origin = link.at
@@ -233,7 +169,7 @@ pub(super) fn refine(
         if !inside {
             return Err(MatchFailure::CurveOutsideImage);
         }
-        pad(window, &samples, &mut padded);
+        window.pad(&samples, &mut padded);
         let d = &derivatives.planes;
         let (cross, sum) = (dot(&window.values, &padded), dot(&window.ones, &padded));
         let mut right_side = SVector::<f64, 6>::from([
@@ -253,8 +189,30 @@ pub(super) fn refine(
                 limit: rules.min_score,
             });
         }
+        // the residual is noise of both windows
+        let n = count as f64;
+        let square = dot(&padded, &padded);
+        let residual = (square - x.dot(&right_side)).max(0.0) / (n - 6.0);
+        let noise_square = residual / (1.0 + gain * gain);
+        let gradients = quieter.as_ref().unwrap_or(&window.exact);
+        let along = &derivatives.along;
+        let inflation = window.inflation(&d[0], gradients, along, noise_square);
+        // the noise of the left values takes as much from the gain
+        let gain = gain / window.signal_part(noise_square);
+        if !is_noise_settled && inflation > NOISY && taken >= FIRST_STEPS {
+            is_noise_settled = true;
+            quieter = window.quieter_gradients(noise_square);
+            if let Some(gradients) = &quieter {
+                derivatives = linearised(gradients, now.slopes)?;
+                continue;
+            }
+        }
         // Derivatives of the left window alone may overshoot for ever about the right answer.
-        let part = if taken < FULL_STEPS { 1.0 } else { 0.5 };
+        let part = if taken < FULL_STEPS {
+            inflation
+        } else {
+            0.5 * inflation
+        };
         let step = Displacement {
             along_px: -x[0] / gain * part,
             slopes: Vector2::new(-x[1], -x[2]) / (gain * half) * part,
@@ -282,37 +240,24 @@ pub(super) fn refine(
             .max(step.across_px.abs())
             .max(half * step.slopes.amax());
         if size < SETTLED_PX {
-            let n = count as f64;
-            let square = dot(&padded, &padded);
             let variance = square - sum * sum / n;
             let score = cross / (window.square * variance).sqrt();
-            let residual = (square - x.dot(&right_side)).max(0.0) / (n - 6.0);
             let inverse = derivatives.factor.inverse();
-            let sigma = (residual.max(0.1) * inverse[(0, 0)]).sqrt() / gain;
+            let sigma = (residual.max(0.1) * inverse[(0, 0)]).sqrt() * inflation / gain;
             return Ok(Refined {
                 displacement: now,
                 score,
                 sigma_px: sigma.hypot(rules.sigma_floor_px),
+                residual_dn: residual.sqrt(),
+                deviations_dn: [window.deviation_dn, (variance / n).max(0.0).sqrt()],
             });
         }
         if (now.slopes - derivatives.slopes).amax() > RELINEARISE_SLOPE {
-            derivatives = Derivatives::new(window, link, now.slopes, hold).ok_or_else(singular)?;
+            derivatives = linearised(quieter.as_ref().unwrap_or(&window.exact), now.slopes)?;
         }
     }
     Err(MatchFailure::Diverged {
         moved_px: (now.along_px - start.along_px).abs(),
         limit_px: rules.max_correction_px,
     })
-}
-
-/// Copies the samples, less the left window's mean, into padded rows.
-fn pad(window: &LeftWindow, samples: &[f32], padded: &mut [f32]) {
-    let lines = samples
-        .chunks_exact(window.side)
-        .zip(padded.chunks_exact_mut(window.stride));
-    for (line, out) in lines {
-        for (o, x) in out.iter_mut().zip(line) {
-            *o = x - window.mean;
-        }
-    }
 }

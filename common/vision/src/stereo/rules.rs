@@ -8,7 +8,13 @@ use serde::{Deserialize, Serialize};
 pub struct MatchRules {
     /// Half the side of the fitted window less half a pixel: 7 means 15 x 15 px.
     pub half_window_px: u32,
-    /// The same for the search along the epipolar curve.
+    /// Half the side less half a pixel that the fitted window may be widened to where noise leaves
+    /// the match more uncertain than `aim_sigma_px`; no more than `half_window_px` never widens. The
+    /// wider window counts only if it agrees with the smaller one and fits as well.
+    pub max_half_window_px: u32,
+    /// Standard deviation from which a window is widened, px.
+    pub aim_sigma_px: f64,
+    /// Half the side of the window that is searched for along the epipolar curve less half a pixel.
     pub half_search_window_px: u32,
     /// Nearest range searched, along the left ray, m.
     pub range_min_m: f64,
@@ -21,7 +27,7 @@ pub struct MatchRules {
     pub min_texture_dn: f64,
     /// Least NCC in the search, with whole-pixel shifts.
     pub min_search_score: f64,
-    /// Least NCC of the fitted windows.
+    /// Least NCC of the fitted windows, freed of what the images' grey noise takes off it.
     pub min_score: f64,
     /// Largest NCC of any other place, as a fraction of the best one's.
     pub uniqueness_ratio: f64,
@@ -46,6 +52,8 @@ impl Default for MatchRules {
     fn default() -> Self {
         Self {
             half_window_px: 7,
+            max_half_window_px: 16,
+            aim_sigma_px: 0.05,
             half_search_window_px: 6,
             range_min_m: 0.35,
             range_max_m: 1.5,
@@ -83,6 +91,7 @@ impl MatchRules {
     pub fn validate(&self) -> Result<(), String> {
         for (name, half) in [
             ("half_window_px", self.half_window_px),
+            ("max_half_window_px", self.max_half_window_px),
             ("half_search_window_px", self.half_search_window_px),
         ] {
             need(name, f64::from(half), (2..=30).contains(&half), "2 to 30")?;
@@ -109,6 +118,7 @@ impl MatchRules {
             need(name, x, (0.0..=1.0).contains(&x), "0 to 1")?;
         }
         for (name, x) in [
+            ("aim_sigma_px", self.aim_sigma_px),
             ("min_texture_dn", self.min_texture_dn),
             ("left_right_tolerance_px", self.left_right_tolerance_px),
             ("max_slope", self.max_slope),

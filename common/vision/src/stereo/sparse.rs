@@ -33,6 +33,11 @@ pub fn sparse_points(
             "the step is 0 px, expected at least 1 px".into(),
         ));
     }
+    // many points of some certainty, not few of the best
+    let rules = &MatchRules {
+        max_half_window_px: rules.half_window_px,
+        ..rules.clone()
+    };
     let first = rules.half_window_px.max(rules.half_search_window_px) + 1;
     let places = |size: u32| -> Vec<u32> {
         (first..size.saturating_sub(first))

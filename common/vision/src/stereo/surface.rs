@@ -6,8 +6,9 @@ use rover_cameras::StereoPair;
 
 use super::link::Link;
 use super::matching::{accept, check_input, match_checked};
-use super::refine::{Displacement, LeftWindow, refine};
+use super::refine::{Displacement, refine};
 use super::surface_fit::{Sample, fit_centre, fit_patch};
+use super::window::LeftWindow;
 use super::{MatchFailure, MatchRules, PreparedImage, StereoMatch, SurfaceRules};
 
 /// A measured surface patch, in the frame of the camera models.
@@ -432,7 +433,7 @@ fn measure_node(
     if found.displacement.along_px.abs() > rules.max_jump_px {
         return None;
     }
-    let checked = accept(&link, &found, pixel, matching).ok()?;
+    let checked = accept(&link, &found, (left, right), pixel, matching).ok()?;
     let ray_point = link.origin + link.direction * checked.range_m;
     let inverse_range = 1.0 / checked.range_m;
     let slopes = found.displacement.slopes / link.px_per_inverse_range;
