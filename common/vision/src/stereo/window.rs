@@ -299,10 +299,7 @@ mod tests {
             let stated = window.inflation(d, &gradients, &direction, 64.0);
             let measured = dot(d, d) / dot(d, &truth.exact.u);
             println!("(d.d) / (d.g): {stated:.3} stated, {measured:.3} measured");
-            assert!(
-                (stated / measured - 1.0).abs() < 0.2,
-                "{stated} {measured}"
-            );
+            assert!((stated / measured - 1.0).abs() < 0.2, "{stated} {measured}");
             found.push(measured);
         }
         assert!(found[0] > 2.0 && found[1] < found[0] && found[2] < found[1]);
