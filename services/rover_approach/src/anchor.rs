@@ -52,12 +52,12 @@ impl Default for TrackRules {
             anchor_ratio: 1.4,
             anchor_turn_rad: 0.25,
             gate: Gate {
-                min_score: 0.85,
+                min_score: 0.80,
                 min_margin: 0.02,
-                max_innovation_sigma: 8.0,
+                max_innovation_sigma: 5.0,
             },
             strict_gate: Gate {
-                min_score: 0.85,
+                min_score: 0.80,
                 min_margin: 0.10,
                 max_innovation_sigma: 2.5,
             },
