@@ -33,14 +33,7 @@ pub(super) fn true_centre(
     let middle = Vector2::new(centre[0], centre[1]);
     let axis = truth.camera.ray(&middle).map_err(|e| bad(&e))?;
     let z = axis.direction.into_inner();
-    // any frame about the ellipse's ray
-    let other = if z.x.abs() < 0.6 {
-        Vector3::x()
-    } else {
-        Vector3::y()
-    };
-    let x = z.cross(&other).normalize();
-    let basis = Matrix3::from_columns(&[x, z.cross(&x), z]);
+    let basis = super::homography::frame_about(&z);
     let mut normal = SMatrix::<f64, 6, 6>::zeros();
     let mut rows = Vec::with_capacity(4 * QUARTER.len());
     let mut reach = 0.0f64;

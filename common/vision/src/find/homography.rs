@@ -21,13 +21,7 @@ pub(super) fn plane_pose(
     let middle_px = points.iter().map(|(_, q)| q).sum::<Vector2<f64>>() / n;
     let axis = camera.ray(&middle_px).ok()?;
     let z = axis.direction.into_inner();
-    let other = if z.x.abs() < 0.6 {
-        Vector3::x()
-    } else {
-        Vector3::y()
-    };
-    let x = z.cross(&other).normalize();
-    let basis = Matrix3::from_columns(&[x, z.cross(&x), z]);
+    let basis = frame_about(&z);
     let mut rays = Vec::with_capacity(points.len());
     let (mut spread_m, mut spread) = (0.0f64, 0.0f64);
     for (p, q) in points {
@@ -107,4 +101,15 @@ pub(super) fn square_homography(corners: &[Vector2<f64>; 4], size: f64) -> Optio
     let h = matrix.lu().solve(&right)?;
     let map = Matrix3::new(h[0], h[1], h[2], h[3], h[4], h[5], h[6], h[7], 1.0);
     map.iter().all(|x| x.is_finite()).then_some(map)
+}
+
+/// Axes of some frame whose last axis is the unit vector `z`.
+pub(super) fn frame_about(z: &Vector3<f64>) -> Matrix3<f64> {
+    let other = if z.x.abs() < 0.6 {
+        Vector3::x()
+    } else {
+        Vector3::y()
+    };
+    let x = z.cross(&other).normalize();
+    Matrix3::from_columns(&[x, z.cross(&x), *z])
 }
