@@ -59,7 +59,7 @@ fn steps(criterion: &mut Criterion) {
 
 /// The Rocky 8 on undulating ground with rocks, a metre forth and back.
 fn driving(criterion: &mut Criterion) {
-    const PERIODS: u32 = 10;
+    const PERIODS: u32 = 3;
     let text = include_str!("../../scenarios/robots/rocky8.toml");
     let robot = Arc::new(Robot::parse(text, "rocky8.toml").unwrap());
     let start = robot.posture("stow").unwrap().to_vec();
@@ -71,24 +71,29 @@ fn driving(criterion: &mut Criterion) {
     terrain.cell_m = 0.025;
     terrain.relief_m = 0.02;
     terrain.relief_wavelength_m = 2.0;
+    terrain.scattered.count_n = 160;
     let mut world = World::new(robot, &description, 1, &start).unwrap();
+    let mut forth = true;
+    let mut set_off = |world: &mut World| {
+        let goal = DriveGoal {
+            arc: DriveArc::Arc {
+                length_m: if forth { 1.0 } else { -1.0 },
+                curvature_1_m: 0.0,
+            },
+            speed_fraction: 1.0,
+            guard: DriveGuard::default(),
+        };
+        forth = !forth;
+        world.start_drive(&goal).unwrap();
+    };
+    set_off(&mut world);
     let steps = u64::from(PERIODS) * world.steps_per_period();
     let mut group = criterion.benchmark_group("control_steps");
     group.throughput(Throughput::Elements(steps));
-    let mut forth = true;
     group.bench_function("driving", |b| {
         b.iter(|| {
             if !world.is_moving() {
-                let goal = DriveGoal {
-                    arc: DriveArc::Arc {
-                        length_m: if forth { 1.0 } else { -1.0 },
-                        curvature_1_m: 0.0,
-                    },
-                    speed_fraction: 1.0,
-                    guard: DriveGuard::default(),
-                };
-                forth = !forth;
-                world.start_drive(&goal).unwrap();
+                set_off(&mut world);
             }
             world.advance(PERIODS)
         });

@@ -30,11 +30,18 @@ fn all_within(checks: &[(&str, f64, RangeInclusive<f64>)]) -> Checked {
 /// Checks everything that a world is built from.
 pub(crate) fn description(d: &SimulationDescription, robot: &Robot, start_rad: &[f64]) -> Checked {
     within("step_s", d.step_s, 1e-4..=0.005)?;
-    let heartbeat_s = robot.description().arm.heartbeat_s;
-    let steps = heartbeat_s / d.step_s;
-    if (steps - steps.round()).abs() > 1e-6 || steps < 0.5 {
-        let expected = format!("a whole fraction of the robot's heartbeat of {heartbeat_s} s");
-        return Err(SimulationError::field("step_s", d.step_s, expected));
+    let r = robot.description();
+    let wheels_s = r.mobility.as_ref().map(|m| m.heartbeat_s);
+    let mast_s = r.mast.as_ref().map(|m| m.heartbeat_s);
+    for heartbeat_s in [Some(r.arm.heartbeat_s), wheels_s, mast_s]
+        .into_iter()
+        .flatten()
+    {
+        let steps = heartbeat_s / d.step_s;
+        if (steps - steps.round()).abs() > 1e-6 || steps < 0.5 {
+            let expected = format!("a whole fraction of the robot's heartbeat of {heartbeat_s} s");
+            return Err(SimulationError::field("step_s", d.step_s, expected));
+        }
     }
     truth(d)?;
     terrain(d)?;

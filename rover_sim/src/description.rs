@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimulationDescription {
-    /// Physics and control step, s. The robot's heartbeat must be a whole multiple of it.
+    /// Physics and control step, s. The robot's heartbeats must be whole multiples of it.
     pub step_s: f64,
     /// How the true robot differs from the believed one.
     pub truth: TruthDescription,

@@ -26,13 +26,14 @@ use rover_messages::mobility::{DriveGoal, DriveResult, DriveStop, WheelsState};
 use rover_robot::{MobilityDescription, VehicleDynamics};
 use soil::Soil;
 
-/// Steps of the world in one step of the driving rover. What is stiff in it (drives, suspension,
-/// contacts) is implicit or far slower than this, and it drives at a tenth of a metre per second.
-const WORLD_STEPS: u64 = 2;
-/// Its steps between two looks at loads, slip and odometry.
-const TICK_STEPS: u64 = 5;
-/// Its consecutive steps below the rest speeds that count as rest.
-const REST_STEPS: u32 = 13;
+/// Longest step of the driving rover, s. What is stiff in it (drives, suspension, contacts) is
+/// implicit, and it drives at a tenth of a metre per second: over undulating ground with stones the
+/// way after 0.8 m differs by 0.7 % in the mean, 2.5 % at most, from that with steps of 0.5 ms.
+const STEP_S: f64 = 0.01;
+/// Time between two looks at loads, slip and odometry, s.
+const TICK_S: f64 = 0.02;
+/// Time below the rest speeds that counts as rest, s.
+const REST_S: f64 = 0.05;
 const REST_M_S: f64 = 2e-4;
 const REST_RAD_S: f64 = 1e-3;
 /// Longest wait for rest, s.
@@ -47,6 +48,10 @@ pub(crate) struct Vehicle {
     odometry: Odometry,
     world_from_site: Isometry3<f64>,
     world_step_s: f64,
+    /// Steps of the world in one of its own.
+    world_steps: u64,
+    /// Its steps between two looks.
+    tick_steps: u64,
     weight_n: f64,
     goal: Option<DriveGoal>,
     pending: Increment,
@@ -54,8 +59,8 @@ pub(crate) struct Vehicle {
     pull: [f64; 6],
     slip_estimate: f64,
     ticks: u64,
-    calm_steps: u32,
-    settling_steps: u64,
+    calm_s: f64,
+    settling_s: f64,
 }
 
 /// What a vehicle is made from.
@@ -80,7 +85,8 @@ impl Vehicle {
     ) -> Result<Self, SimulationError> {
         let start = d.rover.unwrap_or_default();
         let world_from_rover = above_ground(parts.mobility, terrain, &start);
-        let step_s = d.step_s * WORLD_STEPS as f64;
+        let world_steps = whole_steps(STEP_S, d.step_s);
+        let step_s = d.step_s * world_steps as f64;
         let mut physics = RoverPhysics::new(
             parts.mobility,
             parts.dynamics,
@@ -108,14 +114,16 @@ impl Vehicle {
             odometry: Odometry::new(parts.mobility.odometry, scale, seed, &standing),
             world_from_site: levelled(&standing),
             world_step_s: d.step_s,
+            world_steps,
+            tick_steps: whole_steps(TICK_S, step_s),
             weight_n: mass_kg * parts.gravity_m_s2.norm(),
             goal: None,
             pending: Increment::default(),
             pull: [0.0; 6],
             slip_estimate: 0.0,
             ticks: 0,
-            calm_steps: 0,
-            settling_steps: 0,
+            calm_s: 0.0,
+            settling_s: 0.0,
             physics,
         })
     }
@@ -131,7 +139,7 @@ impl Vehicle {
         self.goal = Some(*goal);
         self.pull = [0.0; 6];
         self.slip_estimate = soil::slip(self.soil.mean_resistance());
-        (self.ticks, self.calm_steps, self.settling_steps) = (0, 0, 0);
+        (self.ticks, self.calm_s, self.settling_s) = (0, 0.0, 0.0);
     }
 
     pub fn stop(&mut self, reason: DriveStop) {
@@ -140,7 +148,7 @@ impl Vehicle {
 
     /// One step of the world; `step` is its number. The outcome when the drive has ended.
     pub fn advance(&mut self, step: u64) -> Option<Result<DriveResult, DriveStop>> {
-        if !step.is_multiple_of(WORLD_STEPS) {
+        if !step.is_multiple_of(self.world_steps) {
             return None;
         }
         let increment = self.drive.advance();
@@ -155,21 +163,20 @@ impl Vehicle {
         self.physics.step();
         self.drive.watch_stall(&stalled);
         self.ticks += 1;
-        if self.ticks.is_multiple_of(TICK_STEPS) {
+        if self.ticks.is_multiple_of(self.tick_steps) {
             self.tick(step);
         }
         if self.drive.phase != Phase::Settling {
             return None;
         }
-        self.settling_steps += 1;
-        let (speed, turning) = self.physics.speeds();
-        self.calm_steps = if speed < REST_M_S && turning < REST_RAD_S {
-            self.calm_steps + 1
+        let step_s = self.world_steps as f64 * self.world_step_s;
+        self.settling_s += step_s;
+        self.calm_s = if is_calm(&self.physics) {
+            self.calm_s + step_s
         } else {
-            0
+            0.0
         };
-        let waited_s = (self.settling_steps * WORLD_STEPS) as f64 * self.world_step_s;
-        if self.calm_steps < REST_STEPS && waited_s < SETTLE_LIMIT_S {
+        if self.calm_s < REST_S && self.settling_s < SETTLE_LIMIT_S {
             return None;
         }
         self.tick(step);
@@ -259,7 +266,7 @@ impl Vehicle {
     /// How far the rover moves while its drives hold, m.
     pub fn creep_m(&mut self, steps: u32) -> f64 {
         let before = self.world_from_rover().translation.vector;
-        for _ in 0..steps / WORLD_STEPS as u32 {
+        for _ in 0..u64::from(steps) / self.world_steps {
             self.physics.command(
                 &self.drive.steer_rad,
                 &[0.0; 4],
@@ -309,24 +316,33 @@ fn above_ground(d: &MobilityDescription, terrain: &Terrain, start: &RoverStart) 
     Isometry3::from_parts(Vector3::new(x, y, highest + 0.02).into(), turn)
 }
 
+/// Whole steps of `step_s` that fit in `most_s`, at least one.
+fn whole_steps(most_s: f64, step_s: f64) -> u64 {
+    ((most_s / step_s + 1e-9).floor() as u64).max(1)
+}
+
+fn is_calm(physics: &RoverPhysics) -> bool {
+    let (speed, turning) = physics.speeds();
+    speed < REST_M_S && turning < REST_RAD_S
+}
+
 fn settle(
     physics: &mut RoverPhysics,
     drive: &mut Drive,
     step_s: f64,
 ) -> Result<(), SimulationError> {
-    let mut calm = 0;
-    let limit = (2.0 * SETTLE_LIMIT_S / step_s) as u32;
-    for i in 0..limit {
+    let (mut calm_s, mut waited_s) = (0.0, 0.0);
+    while waited_s < 2.0 * SETTLE_LIMIT_S {
         physics.command(&[0.0; 4], &[0.0; 4], &mut drive.wheel_rad, &[0.0; 6]);
         physics.step();
-        let (speed, turning) = physics.speeds();
-        calm = if speed < REST_M_S && turning < REST_RAD_S {
-            calm + 1
+        waited_s += step_s;
+        calm_s = if is_calm(physics) {
+            calm_s + step_s
         } else {
-            0
+            0.0
         };
         // It starts at rest, in the air.
-        if calm >= REST_STEPS && i > 4 * REST_STEPS {
+        if calm_s >= REST_S && waited_s > 4.0 * REST_S {
             return Ok(());
         }
     }

@@ -296,9 +296,15 @@ impl World {
         outcome
     }
 
-    /// Control steps in one heartbeat period.
+    /// Control steps in one heartbeat period of what is under way: wheels, mast, else arm.
     pub fn steps_per_period(&self) -> u64 {
-        (self.robot.description().arm.heartbeat_s / self.description.step_s).round() as u64
+        let d = self.robot.description();
+        let heartbeat_s = match (&d.mobility, &d.mast) {
+            (Some(mobility), _) if self.is_driving() => mobility.heartbeat_s,
+            (_, Some(mast)) if self.is_pointing() => mast.heartbeat_s,
+            _ => d.arm.heartbeat_s,
+        };
+        (heartbeat_s / self.description.step_s).round() as u64
     }
 
     /// One step of driver and physics, and what contacts and switch do in it.

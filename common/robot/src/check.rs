@@ -3,6 +3,9 @@
 use crate::{CameraMount, Capsule, PoseDescription, RobotDescription, RobotError};
 use nalgebra::{Isometry3, Matrix3, Rotation3, Unit, UnitQuaternion, Vector3};
 
+/// Longest heartbeat period of the arm, and of wheels and mast, which are slow, s.
+const LONGEST_HEARTBEATS_S: [f64; 2] = [0.05, 0.5];
+
 pub(crate) struct Check<'a> {
     pub origin: &'a str,
 }
@@ -68,12 +71,21 @@ impl Check<'_> {
         )?;
         self.positive("model_quality.angle_deg", d.model_quality.angle_deg)?;
         self.positive("model_quality.length_mm", d.model_quality.length_mm)?;
-        self.positive("arm.heartbeat_s", d.arm.heartbeat_s)?;
-        self.require(
-            d.arm.heartbeat_s <= 0.05,
-            "arm.heartbeat_s",
-            format!("{}, expected at most 0.05 s", d.arm.heartbeat_s),
-        )?;
+        let [arm, slow] = LONGEST_HEARTBEATS_S;
+        for (field, heartbeat_s, longest_s) in [
+            ("arm", Some(d.arm.heartbeat_s), arm),
+            ("mobility", d.mobility.as_ref().map(|m| m.heartbeat_s), slow),
+            ("mast", d.mast.as_ref().map(|m| m.heartbeat_s), slow),
+        ] {
+            let Some(found_s) = heartbeat_s else { continue };
+            let field = format!("{field}.heartbeat_s");
+            self.positive(&field, found_s)?;
+            self.require(
+                found_s <= longest_s,
+                &field,
+                format!("{found_s}, expected at most {longest_s} s"),
+            )?;
+        }
         for (i, j) in d.arm.joints.iter().enumerate() {
             self.capsules(&format!("arm.joints[{i}].shape"), &j.shape)?;
         }

@@ -13,6 +13,9 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MobilityDescription {
+    /// Heartbeat period of the wheels' driver, s: simulated time never passes it without a
+    /// heartbeat from the commander.
+    pub heartbeat_s: f64,
     /// Radius of a wheel, m.
     pub wheel_radius_m: f64,
     /// Width of a wheel, m.
@@ -103,6 +106,8 @@ impl OdometryQuality {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MastDescription {
+    /// Heartbeat period of the mast's driver, s, as [`MobilityDescription::heartbeat_s`].
+    pub heartbeat_s: f64,
     /// Frame of the pan joint, its z axis the axis, rover frame.
     pub base: PoseDescription,
     /// Frame of the tilt joint, its y axis the axis, in the frame that pan turns.

@@ -111,7 +111,7 @@ impl RoverPhysics {
         p.max_ccd_substeps = 0;
         // Twice as far as a wheel comes in a step at full speed: nearer, and a wheel may be deep in a
         // stone before the solver knows it; farther, and it sees triangles by the dozen.
-        p.normalized_prediction_distance = 0.001;
+        p.normalized_prediction_distance = 0.002;
         let statics = terrain_colliders(terrain, dynamics.friction)?
             .into_iter()
             .map(|c| c.map(|c| world.insert_collider(c, None)))
