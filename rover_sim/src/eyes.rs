@@ -294,13 +294,10 @@ impl Eyes {
             .cast(&origin, &direction, None)
             .ok_or_else(none)?;
         // The robot's own body, which comes after the terrain, is no target.
-        let mesh = &self
+        let normal = self
             .terrain
-            .bodies
-            .get(hit.mesh_index)
-            .ok_or_else(none)?
-            .mesh;
-        let normal = mean_normal(mesh, &hit.point, self.footprint_m);
+            .mean_normal(hit.mesh_index, &hit.point, self.footprint_m)
+            .ok_or_else(none)?;
         let normal = Unit::try_new(normal, 1e-12).unwrap_or(Unit::new_normalize(hit.normal));
         Ok(SurfacePoint {
             point_m: hit.point,
@@ -341,8 +338,9 @@ impl Eyes {
         along: &Vector3<f64>,
     ) -> Option<SurfacePoint> {
         let hit = self.renderer.cast(origin, along, None)?;
-        let mesh = &self.terrain.bodies.get(hit.mesh_index)?.mesh;
-        let normal = mean_normal(mesh, &hit.point, self.footprint_m);
+        let normal = self
+            .terrain
+            .mean_normal(hit.mesh_index, &hit.point, self.footprint_m)?;
         Some(SurfacePoint {
             point_m: hit.point,
             normal: Unit::try_new(normal, 1e-12)?,
@@ -368,38 +366,6 @@ impl Eyes {
         }
         Ok(())
     }
-}
-
-/// Mean normal of a mesh within `radius_m` of a point, by area.
-fn mean_normal(mesh: &Mesh, centre: &Vector3<f64>, radius_m: f64) -> Vector3<f64> {
-    // Each triangle near the centre is divided into n^2 smaller ones; those inside count.
-    const PARTS: u32 = 8;
-    let mut sum = Vector3::zeros();
-    for t in &mesh.triangles {
-        let [a, b, c] = t.map(|i| mesh.positions[i as usize]);
-        let apart = |k: usize| {
-            a[k].max(b[k]).max(c[k]) < centre[k] - radius_m
-                || a[k].min(b[k]).min(c[k]) > centre[k] + radius_m
-        };
-        if (0..3).any(apart) {
-            continue;
-        }
-        let normal = (b - a).cross(&(c - a));
-        let part = 1.0 / f64::from(PARTS);
-        for i in 0..PARTS {
-            for j in 0..(2 * (PARTS - i) - 1) {
-                // Odd ones stand on their point.
-                let third = if j % 2 == 0 { 1.0 / 3.0 } else { 2.0 / 3.0 };
-                let u = (f64::from(i) + third) * part;
-                let v = (f64::from(j / 2) + third) * part;
-                let p = a + (b - a) * u + (c - a) * v;
-                if (p - centre).norm() <= radius_m {
-                    sum += normal;
-                }
-            }
-        }
-    }
-    sum
 }
 
 /// The links, the plunger, and the fiducial's plate on the last link. The parts' poses are those of

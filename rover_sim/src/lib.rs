@@ -9,7 +9,7 @@
 //! |---|---|
 //! | `description` | what a scenario says about the world |
 //! | `truth` | the true robot, drawn from a seed |
-//! | `terrain` | meshes of ground and rocks |
+//! | `terrain`, `facets` | meshes of ground and rocks, and their mean normals |
 //! | `arm`, `contact_switch`, `statics` | the multibody, the plunger, droop at rest |
 //! | `driver` | trajectories, stops, limits of the motors |
 //! | `eyes` | what true cameras see |
@@ -27,6 +27,7 @@ mod description;
 mod driver;
 mod error;
 mod eyes;
+mod facets;
 pub mod hardware;
 mod rover;
 mod score;

@@ -1,10 +1,12 @@
 //! Ground and rocks. The meshes made here are both drawn and touched.
 
 use crate::description::{RockDescription, TerrainDescription};
+use crate::facets::Facets;
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rover_render::{Mesh, StaticMesh, Surface, shapes};
+use std::sync::OnceLock;
 
 /// Finest undulation that the ground's cells can carry, cells.
 const FINEST_CELLS: f64 = 4.0;
@@ -21,6 +23,8 @@ pub struct Terrain {
     pub rocks_n: usize,
     /// Lines of the ground's grid along x and y, m; its vertices run along x first.
     pub grid_m: [Vec<f64>; 2],
+    /// The facets of each body by place, sorted when first asked for.
+    facets: Vec<OnceLock<Facets>>,
 }
 
 impl Terrain {
@@ -63,6 +67,7 @@ impl Terrain {
         bodies.extend(rock_field(d).iter().map(rock));
         Self {
             rocks_n: bodies.len() - 1,
+            facets: vec![OnceLock::new(); bodies.len()],
             bodies,
             grid_m,
         }
@@ -77,6 +82,19 @@ impl Terrain {
         let [xs, ys] = &self.grid_m;
         let (i, j) = (nearest(xs, x), nearest(ys, y));
         self.bodies[0].mesh.positions[j * xs.len() + i].z
+    }
+
+    /// Outward normal of a body within `radius_m` of a point, by area, not of unit length; `None` if
+    /// there is no such body.
+    pub(crate) fn mean_normal(
+        &self,
+        body: usize,
+        centre: &Vector3<f64>,
+        radius_m: f64,
+    ) -> Option<Vector3<f64>> {
+        let mesh = &self.bodies.get(body)?.mesh;
+        let facets = self.facets[body].get_or_init(|| Facets::of(mesh));
+        Some(facets.mean_normal(mesh, centre, radius_m))
     }
 
     /// Largest extent of a body along an axis, m.

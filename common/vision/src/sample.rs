@@ -179,6 +179,15 @@ impl SplineImage {
         })
     }
 
+    /// The value of [`SplineImage::sample`] alone.
+    #[must_use]
+    pub fn value(&self, u: f64, v: f64) -> Option<f32> {
+        let (iu, fu) = split(u, self.width(), 1, 2)?;
+        let (iv, fv) = split(v, self.height(), 1, 2)?;
+        let (wu, wv) = (spline_weights(fu), spline_weights(fv));
+        Some(gather(&self.coefficients, iu, iv, &wu, &wv))
+    }
+
     /// Whether [`SplineImage::sample`] has a value at (`u`, `v`).
     #[must_use]
     pub fn covers(&self, u: f64, v: f64) -> bool {

@@ -209,13 +209,12 @@ async fn executed<L: Lockstep>(
         let interrupt = context.next_beat().await;
         let why = match &interrupt {
             Interrupt::Beat => {
-                let granted = hands.clone();
-                let (advance, feedback, sim_time_s) = computed(move || {
-                    let advance = granted.grant();
-                    let world = lock(&granted.world);
+                // In place: to hand over to another thread and back takes longer than many a period.
+                let (advance, feedback, sim_time_s) = tokio::task::block_in_place(|| {
+                    let advance = hands.grant();
+                    let world = lock(&hands.world);
                     (advance, L::feedback(&world), world.sim_time_s())
-                })
-                .await?;
+                });
                 if let Some(pace) = hands.pace {
                     tokio::time::sleep_until(pace.due(sim_time_s)).await;
                 }

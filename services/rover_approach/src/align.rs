@@ -125,29 +125,14 @@ impl Template {
         pixel_px: &Vector2<f64>,
         half: HalfSize,
     ) -> Result<Self, TrackError> {
-        Self::cut_spaced(image, pixel_px, half, 1.0)
-    }
-
-    /// The same with pixels so many pixels of the image wide and apart.
-    ///
-    /// # Errors
-    /// As [`Self::cut`].
-    pub fn cut_spaced(
-        image: &PreparedImage,
-        pixel_px: &Vector2<f64>,
-        half: HalfSize,
-        spacing_px: f64,
-    ) -> Result<Self, TrackError> {
-        let footprint = Matrix2::identity() * spacing_px;
-        let patch = Patch::by_map(image, half.grown(1), &footprint, |d| {
-            Some(pixel_px + d * spacing_px)
-        })
-        .ok_or_else(|| TrackError::OutsideImage {
-            u_px: pixel_px.x,
-            v_px: pixel_px.y,
-            columns: half.columns() + 2,
-            rows: half.rows() + 2,
-        })?;
+        let footprint = Matrix2::identity();
+        let patch = Patch::by_map(image, half.grown(1), &footprint, |d| Some(pixel_px + d))
+            .ok_or_else(|| TrackError::OutsideImage {
+                u_px: pixel_px.x,
+                v_px: pixel_px.y,
+                columns: half.columns() + 2,
+                rows: half.rows() + 2,
+            })?;
         let weights = weights(half);
         let normal = normalised(&patch, &weights);
         Ok(Self {

@@ -20,7 +20,7 @@ use crate::view::View;
 use crate::warp::PlaneWarp;
 use fit::{Correction, Fit, Found};
 pub use landmarks::Landmark;
-use nalgebra::{Matrix2, Matrix3, Point3, Vector2, Vector3};
+use nalgebra::{Matrix3, Point3, Vector2, Vector3};
 use rayon::prelude::*;
 
 /// How the motion is found.
@@ -47,8 +47,8 @@ pub struct EgomotionRules {
 /// One search for the landmarks.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Stage {
-    /// Spacing of the templates' pixels, px of the last picture.
-    pub spacing_px: f64,
+    /// Whether in pictures a quarter as wide and high.
+    pub quarter: bool,
     /// Least correlation.
     pub min_score: f64,
     /// By how much the best correlation of a search must exceed the best one elsewhere.
@@ -66,13 +66,13 @@ impl Default for EgomotionRules {
             neighbour_px: 45.0,
             stages: [
                 Stage {
-                    spacing_px: 4.0,
+                    quarter: true,
                     min_score: 0.6,
                     min_margin: 0.05,
                     agree_px: 6.0,
                 },
                 Stage {
-                    spacing_px: 1.0,
+                    quarter: false,
                     min_score: 0.75,
                     min_margin: 0.0,
                     agree_px: 2.0,
@@ -201,34 +201,45 @@ fn find(
     const SIGMAS: f64 = 3.0;
     /// What slant and range may put the pixel off besides, px.
     const RANGE_PX: f64 = 1.0;
-    let camera = &now.cameras.left;
     let half = HalfSize {
         u: rules.half_px,
         v: rules.half_px,
     };
-    let spaced = Matrix2::identity() * stage.spacing_px;
+    let (pictures, scale) = if stage.quarter {
+        ([last.quarter()?, now.quarter()?], 4.0)
+    } else {
+        (
+            [last, now].map(|view| (&view.left, &view.cameras.left)),
+            1.0,
+        )
+    };
+    let [(before, from), (after, camera)] = pictures;
+    let middle = Vector2::repeat(0.5);
+    let pixel_px = (mark.pixel_px + middle) / scale - middle;
     let align = AlignRules::default();
-    let template = Template::cut_spaced(&last.left, &mark.pixel_px, half, stage.spacing_px).ok()?;
+    let template = Template::cut(before, &pixel_px, half).ok()?;
     if template.deviation_dn() < align.min_texture_dn {
         return None;
     }
-    let warp = PlaneWarp::new(&last.cameras.left, &mark.pixel_px, plane)?
-        .adjusted(&Vector2::zeros(), &spaced)?
-        .moved(&sought.now_from_last);
+    let warp = PlaneWarp::new(from, &pixel_px, plane)?.moved(&sought.now_from_last);
     let known = TargetEstimate {
         position_m: mark.point_m,
         covariance_m2: Matrix3::zeros(),
     };
-    let spread = known.predicted(sought).pixel_covariance(camera, RANGE_PX)?;
+    let spread = known
+        .predicted(sought)
+        .pixel_covariance(camera, RANGE_PX / scale)?;
     let reach = reach(&warp.jacobian(camera)?, &spread, SIGMAS).ok()?;
-    let (pixel, score, second) = search(&template, &now.left, camera, &warp, reach).ok()?;
+    let (pixel, score, second) = search(&template, after, camera, &warp, reach).ok()?;
     if !(score >= stage.min_score && score - second >= stage.min_margin) {
         return None;
     }
     let (warp, _) = warp.turned_to(camera, &pixel)?;
     let freedom = Freedom::Translation;
-    let (warp, aligned) = refine(&template, &now.left, camera, &warp, freedom, &align).ok()?;
-    (aligned.score >= stage.min_score)
-        .then(|| warp.pixel(camera, &Vector2::zeros()))
-        .flatten()
+    let (warp, aligned) = refine(&template, after, camera, &warp, freedom, &align).ok()?;
+    if aligned.score < stage.min_score {
+        return None;
+    }
+    let found = warp.pixel(camera, &Vector2::zeros())?;
+    Some((found + middle) * scale - middle)
 }

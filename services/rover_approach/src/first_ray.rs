@@ -383,9 +383,9 @@ impl Scene<'_> {
                             Vector2::new((i as f64 + 0.5) / nu - 0.5, (j as f64 + 0.5) / nv - 0.5);
                         let d = shift + turn * (Vector2::new(u as f64, v as f64) + part);
                         if let Some((q, _)) = self.meet(&d)
-                            && let Some(sample) = self.view.left.sample(q.x, q.y)
+                            && let Some(value) = self.view.left.value(q.x, q.y)
                         {
-                            sum += f64::from(sample.value);
+                            sum += f64::from(value);
                             n += 1.0;
                         }
                     }

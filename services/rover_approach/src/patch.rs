@@ -97,7 +97,7 @@ impl Patch {
                 let q = map(&Vector2::new(u as f64, v as f64))?;
                 let mut sum = 0.0;
                 for o in &offsets {
-                    sum += f64::from(image.sample(q.x + o.x, q.y + o.y)?.value);
+                    sum += f64::from(image.value(q.x + o.x, q.y + o.y)?);
                 }
                 values.push(sum * scale);
             }

@@ -2,8 +2,9 @@
 
 use crate::error::TrackError;
 use crate::own_shadow::OwnShadow;
-use rover_cameras::StereoPair;
+use rover_cameras::{Camera, StereoPair};
 use rover_vision::PreparedImage;
+use std::sync::OnceLock;
 
 /// A stereo frame taken at one stop.
 #[derive(Clone, Debug)]
@@ -16,6 +17,8 @@ pub struct View {
     pub cameras: StereoPair,
     /// Where the rover's own shadow falls, if sun and shape are known.
     pub own_shadow: Option<OwnShadow>,
+    /// Left image and camera a quarter as wide and high, made when first asked for.
+    quarter: OnceLock<Option<(PreparedImage, Camera)>>,
 }
 
 impl View {
@@ -52,7 +55,19 @@ impl View {
             right,
             cameras,
             own_shadow: None,
+            quarter: OnceLock::new(),
         })
+    }
+
+    /// Left image and camera a quarter as wide and high; `None` if they are too small for that.
+    /// A pixel `p` is there `(p + 0.5) / 4 - 0.5`.
+    #[must_use]
+    pub fn quarter(&self) -> Option<(&PreparedImage, &Camera)> {
+        let made = self.quarter.get_or_init(|| {
+            let camera = self.cameras.left.downsampled(4).ok()?;
+            Some((self.left.quarter()?, camera))
+        });
+        made.as_ref().map(|(image, camera)| (image, camera))
     }
 
     /// The same with the rover's own shadow known.
