@@ -12,7 +12,7 @@ use crate::{
     scenario::LoadedScenario,
 };
 use picture::{Mark, Overlay, figure};
-use rover_messages::placement::Look;
+use rover_messages::{imaging::ImageData, placement::Look};
 use rover_page::{
     BLUE, GREEN, ORANGE, PURPLE, YELLOW, document, escape,
     plot::{Marks, Plot, Series},
@@ -45,8 +45,9 @@ pub fn page(
     body += &header(report, &scenario.description);
     body += &cards(report);
     body += &views(evidence)?;
-    body += &images(evidence)?;
+    body += &designation(evidence)?;
     body += &approach::approach(report, evidence)?;
+    body += &where_the_servo_ended(evidence)?;
     body += &servo(report, evidence);
     let kinds = timeline::kinds(&report.wall_by_kind_s);
     body += &section("Timeline", &(timeline::timeline(&report.phases) + &kinds));
@@ -161,74 +162,67 @@ fn views(evidence: &Evidence) -> Result<String, PageError> {
     ))
 }
 
-fn images(evidence: &Evidence) -> Result<String, PageError> {
-    let mut out = String::new();
+fn cross_at(pixel: [f64; 2]) -> Mark {
+    Mark::cross(pixel, ORANGE, "target")
+}
+
+/// Two pictures side by side under a heading.
+fn pictures(title: &str, pair: [(&ImageData, Overlay, String); 2]) -> Result<String, PageError> {
+    let mut figures = String::new();
+    for (image, overlay, caption) in pair {
+        figures += &figure(image, &overlay, &caption)?;
+    }
+    Ok(section(
+        title,
+        &format!("<div class=\"pair\">{figures}</div>"),
+    ))
+}
+
+fn designation(evidence: &Evidence) -> Result<String, PageError> {
+    let Some(frame) = &evidence.designation else {
+        return Ok(String::new());
+    };
     let target = evidence.target.as_ref();
-    let cross = |pixel: [f64; 2]| Mark::cross(pixel, ORANGE, "target");
-    if let Some(frame) = &evidence.designation {
-        let mut figures = String::new();
-        for (image, pixel, side, how) in [
-            (
-                &frame.images.left,
-                target.map(|t| t.pixel_px),
-                "Left",
-                "designated",
-            ),
-            (
-                &frame.images.right,
-                target.map(|t| t.right_pixel_px),
-                "Right",
-                "matched",
-            ),
-        ] {
-            let overlay = Overlay {
-                marks: pixel.into_iter().map(cross).collect(),
-                path: vec![],
-            };
-            let caption = match pixel {
-                Some([u, v]) => format!("{side}, {how} at {u:.2}, {v:.2} px"),
-                None => side.to_owned(),
-            };
-            figures += &figure(image, &overlay, &caption)?;
-        }
-        out += &section(
-            "Designation",
-            &format!("<div class=\"pair\">{figures}</div>"),
-        );
-    }
-    let target = evidence.handed_over.as_ref().or(target);
-    if let Some(frame) = &evidence.standoff {
-        let mut figures = String::new();
-        for (image, pixel, side, of) in [
-            (
-                &frame.images.left,
-                target.map(|t| t.pixel_px),
-                "Left",
-                (|l: &Look| l.left_px) as fn(&Look) -> Option<[f64; 2]>,
-            ),
-            (
-                &frame.images.right,
-                target.map(|t| t.right_pixel_px),
-                "Right",
-                |l| l.right_px,
-            ),
-        ] {
-            let path: Vec<_> = evidence.looks.iter().filter_map(of).collect();
-            let mut marks: Vec<_> = pixel.into_iter().map(cross).collect();
-            marks.extend(path.last().map(|p| Mark::ring(*p, YELLOW, "fiducial")));
-            let seen = path.len();
-            let caption = format!(
-                "{side}, fiducial seen in {seen} of {} looks",
-                evidence.looks.len()
-            );
-            figures += &figure(image, &Overlay { marks, path }, &caption)?;
-        }
-        out += &section(
-            "Where the servo ended",
-            &format!("<div class=\"pair\">{figures}</div>"),
-        );
-    }
-    Ok(out)
+    let side = |name: &str, how: &str, pixel: Option<[f64; 2]>| {
+        let overlay = Overlay {
+            marks: pixel.into_iter().map(cross_at).collect(),
+            path: vec![],
+        };
+        let caption = match pixel {
+            Some([u, v]) => format!("{name}, {how} at {u:.2}, {v:.2} px"),
+            None => name.to_owned(),
+        };
+        (overlay, caption)
+    };
+    let (left, named) = side("Left", "designated", target.map(|t| t.pixel_px));
+    let (right, matched) = side("Right", "matched", target.map(|t| t.right_pixel_px));
+    let images = &frame.images;
+    let pair = [(&images.left, left, named), (&images.right, right, matched)];
+    pictures("Designation", pair)
+}
+
+fn where_the_servo_ended(evidence: &Evidence) -> Result<String, PageError> {
+    let Some(frame) = &evidence.standoff else {
+        return Ok(String::new());
+    };
+    let target = evidence.handed_over.as_ref().or(evidence.target.as_ref());
+    let looks = &evidence.looks;
+    let side = |name: &str, pixel: Option<[f64; 2]>, of: fn(&Look) -> Option<[f64; 2]>| {
+        let path: Vec<_> = looks.iter().filter_map(of).collect();
+        let mut marks: Vec<_> = pixel.into_iter().map(cross_at).collect();
+        marks.extend(path.last().map(|p| Mark::ring(*p, YELLOW, "fiducial")));
+        let (seen, all) = (path.len(), looks.len());
+        let caption = format!("{name}, fiducial seen in {seen} of {all} looks");
+        (Overlay { marks, path }, caption)
+    };
+    let (left, on_left) = side("Left", target.map(|t| t.pixel_px), |l| l.left_px);
+    let (right, on_right) = side("Right", target.map(|t| t.right_pixel_px), |l| l.right_px);
+    let images = &frame.images;
+    let pair = [
+        (&images.left, left, on_left),
+        (&images.right, right, on_right),
+    ];
+    pictures("Where the servo ended", pair)
 }
 
 fn servo(report: &RunReport, evidence: &Evidence) -> String {

@@ -173,7 +173,11 @@ impl<'a> Mission<'a> {
     /// To the standoff and on to contact.
     async fn place_from_here(&mut self, record: &mut Record, target: &Target) -> Result<(), Fault> {
         let (peer, question_limit) = (self.peer, self.scenario.limits.question());
-        let placed = self.reach_standoff(target).await;
+        let lost_m = record
+            .approach
+            .as_ref()
+            .map_or(0.0, |a| a.forecast_mm * 1e-3);
+        let placed = self.reach_standoff(target, lost_m).await;
         if let Some(evidence) = &mut self.evidence {
             evidence
                 .at_standoff(peer, &target.pair, question_limit)
@@ -193,7 +197,7 @@ impl<'a> Mission<'a> {
     }
 
     /// Surveys the ground before the arm and brings the instrument to the standoff.
-    async fn reach_standoff(&mut self, target: &Target) -> Result<PlaceResult, Fault> {
+    async fn reach_standoff(&mut self, target: &Target, lost_m: f64) -> Result<PlaceResult, Fault> {
         let (peer, scenario) = (self.peer, self.scenario);
         let question_limit = scenario.limits.question();
         let started = self.begin("survey");
@@ -208,7 +212,7 @@ impl<'a> Mission<'a> {
         self.end(started, surveyed).await?;
 
         let started = self.begin("servo");
-        let goal = scenario.place_goal(target);
+        let goal = scenario.place_goal(target, lost_m);
         let (observer, evidence) = (&mut *self.observer, &mut self.evidence);
         let placed = act(
             peer,

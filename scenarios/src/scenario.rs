@@ -469,8 +469,9 @@ impl Scenario {
         Some(settings)
     }
 
-    /// The servo's goal for a selected target.
-    pub fn place_goal(&self, target: &Target) -> PlaceGoal {
+    /// The servo's goal for a selected target. `lost_m` is what may be lost of it on the way
+    /// (95 %), as was told before the drive: the servo's limit is on what comes on top.
+    pub fn place_goal(&self, target: &Target, lost_m: f64) -> PlaceGoal {
         PlaceGoal {
             target: target.clone(),
             stations_m: self.servo.stations_m.clone(),
@@ -478,7 +479,7 @@ impl Scenario {
             observation: self.servo.observation,
             tolerance_m: self.servo.tolerance_mm * 1e-3,
             max_corrections_n: self.servo.max_corrections_n,
-            max_predicted_error_m: self.servo.max_predicted_error_mm * 1e-3,
+            max_predicted_error_m: lost_m.hypot(self.servo.max_predicted_error_mm * 1e-3),
         }
     }
 

@@ -23,4 +23,4 @@ pub use mobile::{
     CameraMount, ComplianceDescription, MastDescription, MastQuality, MobilityDescription,
     MobilityLimits, OdometryQuality, VehicleDynamics,
 };
-pub use robot::{Robot, RobotError};
+pub use robot::{Robot, RobotError, TOOL_REACH_M};

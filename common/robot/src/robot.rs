@@ -7,6 +7,11 @@ use rover_kinematics::{Arm, DhRow, JointLimits, Tool};
 use sha2::{Digest, Sha256};
 use std::path::Path;
 
+/// How far from the tip the last link is the tool, which may touch what it is placed on, m: the
+/// plunger and the barrel that carries it. A map of the terrain whose cells are columns up to their
+/// highest point reaches, beside a steep target, into the space that the barrel needs.
+pub const TOOL_REACH_M: f64 = 0.12;
+
 /// Why a robot description cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum RobotError {

@@ -178,7 +178,7 @@ impl ApproachReport {
             n => format!(", {n} base poses in vain"),
         };
         format!(
-            "{:.2} m in {} stops, {looks} looks, handed over within {:.2} px{spot}{earlier}",
+            "{:.2} m in {} stops, {looks} looks, handed over {:.1} px from where the mounts put it{spot}{earlier}",
             self.driven_m,
             self.stops.len(),
             self.handover_px

@@ -86,7 +86,8 @@ const FIELDS: &[(&str, &str)] = &[
     ),
     (
         "servo.max_predicted_error_mm",
-        "Refuse to go on when the predicted lateral error (95 % bound) exceeds this, mm.",
+        "Refuse to go on when the predicted lateral error (95 % bound) exceeds this, mm; after an \
+         approach, this and its forecast together.",
     ),
     ("contact", "How contact is made."),
     ("contact.speed_mm_s", "Speed along the normal, mm/s."),

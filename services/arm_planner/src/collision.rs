@@ -10,7 +10,7 @@ use crate::segment::{Closest, Segment};
 use crate::terrain_map::TerrainMap;
 use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 use rover_kinematics::ArmError;
-use rover_robot::Robot;
+use rover_robot::{Robot, TOOL_REACH_M};
 use std::sync::Arc;
 
 /// Smallest and largest required distance, m.
@@ -128,10 +128,6 @@ pub(crate) struct Placed {
     pub tip: Vector3<f64>,
 }
 
-/// How far from the tip the last link is the tool, which may touch, m: the plunger and the barrel
-/// that carries it. The map's cells are columns up to their highest point, so beside a steep target
-/// they reach into the space that the barrel needs.
-pub const TOOL_REACH_M: f64 = 0.12;
 /// Length of the plunger's capsule behind the tip, m.
 const PLUNGER_M: f64 = 0.02;
 

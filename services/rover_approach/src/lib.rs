@@ -13,6 +13,8 @@
 pub mod align;
 pub mod anchor;
 pub mod base_pose;
+#[cfg(feature = "bus")]
+mod budget;
 pub mod drive;
 pub mod egomotion;
 pub mod error;

@@ -6,12 +6,13 @@ mod look;
 mod near;
 
 use crate::anchor::TrackRules;
+use crate::budget::{Budget, Standpoint};
 use crate::drive::{DriveRules, next_movement, straight};
 use crate::egomotion::Landmark;
 use crate::filter::{Motion, TargetEstimate};
 use crate::hardware::{Frame, Hardware, Light, fault};
 use crate::obstacles::PlanarPose;
-use crate::report::{Budget, sigma_mm};
+use crate::report::sigma_mm;
 use crate::service::unfit;
 use crate::shade::Shade;
 use crate::track::Tracker;
@@ -120,8 +121,7 @@ impl<'a> Session<'a> {
         if let Some(slope) = goal.limits.max_slope_rad {
             rules.max_slope_rad = slope;
         }
-        let focal_px = now.view.cameras.left.model.cahv()[2].norm();
-        let budget = Budget::designated(surface, focal_px);
+        let budget = Budget::designated(surface, &standpoint(&now, &wheels));
         let mut session = Self {
             hardware,
             goal,
@@ -160,8 +160,11 @@ impl<'a> Session<'a> {
         loop {
             let range_m = self.estimate.position_m.xy().norm();
             self.tell(ApproachActivity::Planning);
-            self.look_ahead().await?;
-            let arcs = if std::mem::take(&mut self.stuck) {
+            let stuck = std::mem::take(&mut self.stuck);
+            if !stuck {
+                self.look_ahead().await?;
+            }
+            let arcs = if stuck {
                 self.aim = None;
                 vec![straight(-RETREAT_M).arc]
             } else if range_m > NEAR_M {
@@ -331,6 +334,14 @@ impl IntoIsometry for UnitQuaternion<f64> {
 fn sun_of(goal: &DriveToGoal) -> Option<Vector3<f64>> {
     let sun = Vector3::from(goal.sun_in_site?).try_normalize(1e-9)?;
     (sun.z > 0.0).then_some(sun)
+}
+
+/// Where a frame's left image was taken.
+fn standpoint<'a>(frame: &'a Frame, wheels: &WheelsState) -> Standpoint<'a> {
+    Standpoint {
+        camera: &frame.view.cameras.left,
+        site_from_rover: wheels.pose.site_from_rover().isometry.rotation,
+    }
 }
 
 fn wheels_of(frame: &Frame) -> Result<WheelsState, Fault> {

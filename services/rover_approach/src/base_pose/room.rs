@@ -3,14 +3,12 @@
 use super::TargetSpot;
 use crate::shade::point_to_segment;
 use nalgebra::{Point3, Vector3};
-use rover_robot::Robot;
+use rover_robot::{Robot, TOOL_REACH_M};
 
 /// Farther aside the tangent plane does not speak for the surface, m.
 const NEAR_M: f64 = 0.25;
 /// Places looked at on each shape.
 const PLACES: u32 = 5;
-/// Part of the last link about its tip that may touch, m.
-const TOOL_M: f64 = 0.12;
 /// How much nearer the rest of the last link may come.
 const NEARER: f64 = 3.0;
 
@@ -37,7 +35,7 @@ pub(super) fn room_m(robot: &Robot, spot: &TargetSpot, joints_rad: &[f64]) -> Op
                 let place = a + (b - a) * part;
                 let away = place - spot.position_m;
                 let above_m = away.dot(&spot.normal);
-                if is_last && (place - tip).norm() < TOOL_M {
+                if is_last && (place - tip).norm() < TOOL_REACH_M {
                     continue;
                 }
                 let mut least_m = place.z;

@@ -1,12 +1,12 @@
 //! The end of the approach: first ray, hand-over, and the target as the body pair sees it.
 
-use super::Session;
+use super::{Session, standpoint};
 use crate::base_pose::{BaseRules, Serving, TargetSpot};
 use crate::first_ray::{FirstRayRules, first_ray};
 use crate::handover::{HandoverRules, hand_over};
 use crate::hardware::fault;
 use crate::service::unfit;
-use nalgebra::{Matrix3, Vector2};
+use nalgebra::Vector2;
 use rover_geometry::tangent_basis;
 use rover_messages::{
     Fault,
@@ -56,7 +56,7 @@ impl Session<'_> {
             Ok(found) => found,
             Err(e) => return self.elsewhere(fault("handover_failed", e.to_string())),
         };
-        self.budget.handed(&found, focal_px);
+        self.budget.handed(&found, &standpoint(&body, &self.wheels));
         let mut target = match self.acceptable(&found.pixel_px, &found.surface).await {
             Ok(target) => target,
             Err(refusal) => return self.elsewhere(refusal),
@@ -69,9 +69,10 @@ impl Session<'_> {
         if let Err(reason) = self.served_from_here(&spot, &BaseRules::at_the_limit())? {
             return self.otherwise(&target, &reason);
         }
-        let lateral = self.budget.lateral_m();
-        let n = target.normal.unit.into_inner();
-        let spread = (Matrix3::identity() - n * n.transpose()) * (lateral * lateral);
+        let to_site = self.wheels.pose.site_from_rover().isometry.rotation;
+        let normal = to_site * target.normal.unit.into_inner();
+        let to_site = to_site.to_rotation_matrix();
+        let spread = to_site.transpose() * self.budget.along(&normal) * to_site;
         for (i, row) in target.covariance_m2.iter_mut().enumerate() {
             for (j, value) in row.iter_mut().enumerate() {
                 *value += spread[(i, j)];

@@ -1,11 +1,11 @@
 //! A look from a stop: what moved, where the target is now, and what to do when it is not found.
 
-use super::{Session, wheels_of};
+use super::{Session, standpoint, wheels_of};
 use crate::egomotion::{Egomotion, EgomotionRules, egomotion};
 use crate::filter::Motion;
 use crate::fix::{Fix, Refusal};
 use crate::hardware::{Frame, fault};
-use crate::report::{sighting, sigma_mm};
+use crate::report::{sighting, sigma_mm, worst_sigma_mm};
 use crate::view::View;
 use nalgebra::Vector3;
 use rover_messages::{
@@ -35,8 +35,7 @@ impl Session<'_> {
     /// After a motion: where is the target now, and is it known well enough?
     pub(super) async fn look(&mut self, motion: &Motion, near: bool) -> Result<(), Fault> {
         self.track(motion, near).await?;
-        let sigma = sigma_mm(&self.estimate.covariance_m2);
-        let worst = sigma.iter().fold(0.0_f64, |m, s| m.max(*s));
+        let worst = worst_sigma_mm(&self.estimate.covariance_m2);
         if let Some(limit) = self.goal.limits.max_sigma_mm
             && near
             && worst > limit
@@ -66,7 +65,6 @@ impl Session<'_> {
                 .await?;
             let wheels = wheels_of(&frame)?;
             let camera = &frame.view.cameras.left;
-            let focal_px = camera.model.cahv()[2].norm();
             let eye = camera.model.cahv()[0];
             let expected = odometry.seen_from(eye, mount_rad, pointing_rad);
             let seen = self.seen_motion(&frame, &expected);
@@ -105,7 +103,7 @@ impl Session<'_> {
                 .map_err(|e| fault("target_lost", e.to_string()))?;
             // what the tracked pixel says counts; the filter is for the prediction
             self.estimate.position_m = fix.surface.plane.point;
-            self.budget.tracked(&fix, focal_px);
+            self.budget.tracked(&fix, &standpoint(&frame, &wheels));
             (self.now, self.wheels) = (frame, wheels);
             self.remember_ground();
             self.record(sightings, seen, &fix);
@@ -144,9 +142,7 @@ impl Session<'_> {
     ) -> Result<(), Fault> {
         self.missed_n += 1;
         let range_m = self.estimate.position_m.xy().norm();
-        let worst_mm = sigma_mm(&self.estimate.covariance_m2)
-            .iter()
-            .fold(0.0_f64, |m, s| m.max(*s));
+        let worst_mm = worst_sigma_mm(&self.estimate.covariance_m2);
         // Where landmarks tell the way, it is known as well as the target was.
         let most_n = if refusal.by_the_rover() || seen.is_some() {
             LONG_MISSES_N
