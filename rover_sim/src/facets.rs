@@ -179,7 +179,7 @@ mod tests {
 
     #[test]
     fn the_mean_normal_of_a_ball_points_outwards() {
-        let mesh = shapes::rock(1, 0.5, 4, 0.0);
+        let mesh = shapes::rock(1, 0.5, 6, 0.0);
         let index = Facets::of(&mesh);
         for way in [Vector3::x(), Vector3::new(0.6, 0.0, 0.8), Vector3::z()] {
             let normal = index.mean_normal(&mesh, &(way * 0.5), 0.05);

@@ -243,7 +243,7 @@ fn it_does_not_drive_with_the_arm_out_nor_move_two_things_at_once() {
         tilt_rad: 0.1,
     };
     assert_eq!(world.start_pointing(&point).unwrap_err().name, "busy");
-    for _ in 0..100 {
+    for _ in 0..10 {
         world.advance(1);
     }
     world.stop_drive(DriveStop::Cancelled);

@@ -354,6 +354,7 @@ pub(crate) mod tests {
 
     pub fn mobility() -> MobilityDescription {
         MobilityDescription {
+            heartbeat_s: 0.2,
             wheel_radius_m: 0.125,
             wheel_width_m: 0.12,
             track_m: 0.72,
