@@ -52,6 +52,10 @@ pub struct DriveToGoal {
     /// Base poses from which the placement has failed already: none like them is chosen again.
     #[serde(default)]
     pub avoid: Vec<SitePose>,
+    /// What an earlier approach has lost of the place that was named first: the
+    /// [`DriveToResult::lost_m2`] of it where `anchor` is its last image.
+    #[serde(default)]
+    pub lost_m2: [[f64; 3]; 3],
 }
 
 /// What the approach is doing.
@@ -193,6 +197,9 @@ pub struct DriveToResult {
     pub spot_offset_m: Option<[f64; 3]>,
     /// Error of the position by source.
     pub budget: Vec<ErrorShare>,
+    /// What tracking may have lost of the place that was named: covariance along the surface, site
+    /// frame, m^2. It is in the target's own covariance already.
+    pub lost_m2: [[f64; 3]; 3],
     /// What was forecast before the drive, see [`DriveToFeedback::forecast_mm`].
     pub forecast_mm: f64,
     /// The target in the left image of the pair that tracked it, as it was handed over, px.
@@ -213,7 +220,7 @@ pub struct DriveToResult {
 wire! { DriveToFeedback = "drive_to_feedback/3" }
 
 impl Wire for DriveToGoal {
-    const SCHEMA: &'static str = "drive_to_goal/3";
+    const SCHEMA: &'static str = "drive_to_goal/4";
     fn validate(&self) -> Result<(), String> {
         self.target.validate().map_err(|e| format!("target.{e}"))?;
         if self.anchor.pair != self.target.pair {
@@ -243,16 +250,18 @@ impl Wire for DriveToGoal {
             let numbers = [place.x, place.y, place.z, pose.heading_rad];
             finite(&format!("avoid[{i}]"), &numbers)?;
         }
+        finite("lost_m2", self.lost_m2.as_flattened())?;
         in_range("spot_radius_m", self.spot_radius_m, 0.0, 1.0)
     }
 }
 
 impl Wire for DriveToResult {
-    const SCHEMA: &'static str = "drive_to_result/4";
+    const SCHEMA: &'static str = "drive_to_result/5";
     fn validate(&self) -> Result<(), String> {
         self.target.validate().map_err(|e| format!("target.{e}"))?;
         finite("tracked_px", &self.tracked_px)?;
         finite("handover_px", &[self.handover_px, self.driven_m])?;
+        finite("lost_m2", self.lost_m2.as_flattened())?;
         for (i, share) in self.budget.iter().enumerate() {
             in_range(&format!("budget[{i}].sigma_mm"), share.sigma_mm, 0.0, 1e4)?;
         }

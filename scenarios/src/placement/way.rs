@@ -127,8 +127,11 @@ impl Mission<'_> {
         most_n: u32,
     ) -> Result<(), Fault> {
         let mut driven_m = 0.0;
+        let mut forecast_mm = None;
         loop {
             let mut reached = self.drive_to(goal.clone()).await?;
+            // What a person was told before anything moved.
+            reached.forecast_mm = *forecast_mm.get_or_insert(reached.forecast_mm);
             if let Some(limit_m) = &mut goal.limits.max_distance_m {
                 *limit_m = (*limit_m - reached.driven_m).max(0.0);
             }
@@ -146,6 +149,7 @@ impl Mission<'_> {
             tracing::info!(%fault, "another base pose is tried");
             self.take_up(STOWED).await?;
             goal.avoid.push(reached.base.pose);
+            goal.lost_m2 = reached.lost_m2;
             goal.target.pixel_px = reached.tracked_px;
             goal.anchor = reached.tracked_in;
             if let Some(stop) = reached.stops.last() {

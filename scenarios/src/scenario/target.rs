@@ -210,6 +210,7 @@ impl ApproachSettings {
             },
             spot_radius_m: self.spot_radius_mm * 1e-3,
             avoid: Vec::new(),
+            lost_m2: [[0.0; 3]; 3],
         }
     }
 }

@@ -30,6 +30,9 @@ const FORECAST_PX: f64 = 0.4;
 /// placements that they were fitted to ended within the forecast, on rock and on ground alike.
 const FORECAST_ARM_MM: f64 = 2.0;
 
+/// Standard deviations of one axis that hold 95 %.
+const SIGMAS_95: f64 = 1.96;
+
 /// Flatter than this (cosine) no surface is taken to be seen.
 const LEAST_COSINE: f64 = 0.05;
 
@@ -68,6 +71,8 @@ impl Standpoint<'_> {
 pub(crate) struct Budget {
     /// Of one pixel of the image in which the target was named.
     named_px: Matrix3<f64>,
+    /// What an earlier approach has lost.
+    lost: Matrix3<f64>,
     tracking: Matrix3<f64>,
     relief: Matrix3<f64>,
     handover: Matrix3<f64>,
@@ -76,10 +81,11 @@ pub(crate) struct Budget {
 }
 
 impl Budget {
-    /// At the designation.
-    pub fn designated(surface: &StereoPlane, from: &Standpoint<'_>) -> Self {
+    /// At the designation; `lost` is what an earlier approach has lost, site frame, m^2.
+    pub fn designated(surface: &StereoPlane, from: &Standpoint<'_>, lost: &[[f64; 3]; 3]) -> Self {
         Self {
             named_px: from.pixel_m2(&surface.plane),
+            lost: Matrix3::from_fn(|i, j| lost[i][j]),
             ..Self::default()
         }
     }
@@ -88,17 +94,26 @@ impl Budget {
     /// image in which the target was named: what tracking loses over an approach is so many of
     /// that image's pixels, whatever the range, and a pixel of a surface seen flat covers much.
     pub fn forecast_mm(&self) -> f64 {
-        (FORECAST_PX * longest(&self.named_px) * 1e3).hypot(FORECAST_ARM_MM)
+        let earlier_mm = SIGMAS_95 * longest(&self.lost) * 1e3;
+        let tracking_mm = FORECAST_PX * longest(&self.named_px) * 1e3;
+        tracking_mm.hypot(FORECAST_ARM_MM).hypot(earlier_mm)
     }
 
-    /// All tracking, not below its floor.
+    /// All tracking, that of this approach not below its floor.
     fn tracking(&self) -> Matrix3<f64> {
         let floor = self.named_px * (TRACKING_FLOOR_PX * TRACKING_FLOOR_PX);
-        if self.tracking.trace() > floor.trace() {
+        let own = if self.tracking.trace() > floor.trace() {
             self.tracking
         } else {
             floor
-        }
+        };
+        own + self.lost
+    }
+
+    /// What this approach and those before it have lost of the place named first, site frame, m^2.
+    pub fn lost_m2(&self) -> [[f64; 3]; 3] {
+        let lost = self.tracking() + self.relief;
+        [0, 1, 2].map(|i| [0, 1, 2].map(|j| lost[(i, j)]))
     }
 
     /// One more match against an anchor; only where a new anchor is made does its error stay.

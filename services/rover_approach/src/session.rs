@@ -121,7 +121,7 @@ impl<'a> Session<'a> {
         if let Some(slope) = goal.limits.max_slope_rad {
             rules.max_slope_rad = slope;
         }
-        let budget = Budget::designated(surface, &standpoint(&now, &wheels));
+        let budget = Budget::designated(surface, &standpoint(&now, &wheels), &goal.lost_m2);
         let mut session = Self {
             hardware,
             goal,

@@ -91,6 +91,7 @@ impl Session<'_> {
             target,
             spot_offset_m: self.spot_offset_m.map(Into::into),
             budget: self.budget.shares(),
+            lost_m2: self.budget.lost_m2(),
             forecast_mm: self.forecast_mm,
             tracked_px,
             tracked_in: self.now.reference.clone(),
