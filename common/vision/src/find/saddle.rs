@@ -54,7 +54,7 @@ impl Default for SaddleRules {
             window_px: 8.0,
             smoothing_px: 1.5,
             min_contrast_dn: 20.0,
-            min_contrast_to_noise: 15.0,
+            min_contrast_to_noise: 17.0,
             min_score: 0.93,
             max_residual_fraction: 0.025,
             noise_dn: 6.0,
@@ -193,10 +193,10 @@ impl PixelModel<5> for Crossing {
     /// crossing than at it; quadrants of unequal grey (in units of the contrast); a gap or a neck at
     /// the crossing.
     const DEFORMATIONS: usize = 13;
-    const GRANTED_PX: f64 = 0.05;
-    /// Of crossings one in a hundred exceeds this, of the places where two dark patches of
-    /// thresholded texture meet corner to corner and that pass with 2.5, all but one in thirty.
-    const MAX_DEFORMATION: f64 = 1.4;
+    const GRANTED_PX: f64 = 0.07;
+    /// Of crossings one in a hundred exceeds this; of the places where two dark patches of
+    /// thresholded texture meet corner to corner and which pass with 2.5, all but one in fifty.
+    const MAX_DEFORMATION: f64 = 1.15;
 
     fn deform(&self, p: &[f64; 5], u: f64, v: f64, out: &mut [f64]) {
         let (du, dv) = (u - p[0], v - p[1]);

@@ -105,7 +105,7 @@ fn a_crossing_must_stand_out_from_the_noise() {
     let refusal = find(&picture(0.0, 45.0, 5.0)).unwrap_err();
     match refusal {
         NoFinding::LowContrast { needed_dn, .. } => {
-            assert!((70.0..85.0).contains(&needed_dn), "{needed_dn}");
+            assert!((80.0..95.0).contains(&needed_dn), "{needed_dn}");
         }
         other => panic!("{other}"),
     }
