@@ -36,6 +36,8 @@ pub(super) struct Refined {
     pub residual_dn: f64,
     /// Standard deviations of the left and the right window, DN.
     pub deviations_dn: [f64; 2],
+    /// Side of the window, px.
+    pub side_px: usize,
 }
 
 const MAX_STEPS: usize = 20;
@@ -291,6 +293,7 @@ fn refine_plain(
                 sigma_px: sigma.hypot(rules.sigma_floor_px),
                 residual_dn: residual.sqrt(),
                 deviations_dn: [window.deviation_dn, (variance / n).max(0.0).sqrt()],
+                side_px: window.side,
             });
         }
         if (now.slopes - derived.slopes).amax() <= RELINEARISE_SLOPE {
