@@ -4,6 +4,7 @@
 use criterion::{Criterion, criterion_group, criterion_main};
 use nalgebra::{Isometry3, Vector2};
 use rover_vision::find::{self, DiscRules, SaddleRules, TagRules, TemplateRules};
+use rover_vision::harris::HarrisRules;
 use rover_vision::ncc::{TemplatePyramid, Window, search};
 use rover_vision::*;
 
@@ -101,6 +102,10 @@ fn template(c: &mut Criterion) {
     c.bench_function("template 31 x 31, whole image", |b| {
         b.iter(|| search(&image, &template, Window::whole(&image)).unwrap());
     });
+    c.bench_function("harris, whole image", |b| {
+        let rules = HarrisRules::default();
+        b.iter(|| find::harris(&image, Window::whole(&image), &rules).unwrap());
+    });
     let picture: Vec<u8> = values.iter().map(|&x| x as u8).collect();
     let picture = Image8::from_raw(31, 31, picture).unwrap();
     c.bench_function(
@@ -171,5 +176,35 @@ fn stereo(c: &mut Criterion) {
     });
 }
 
-criterion_group!(benches, fiducial, template, stereo);
+/// The image library of the field in Rust, on the same image: normalised cross-correlation at every
+/// whole pixel, and its interest points (FAST has no subpixel place).
+fn peer(c: &mut Criterion) {
+    use imageproc::image::GrayImage;
+    use imageproc::template_matching::{MatchTemplateMethod, find_extremes, match_template};
+    let pair = synthetic::pair();
+    let pose = synthetic::facing_pose(&pair.left, Vector2::new(320.0, 240.0), 0.6, 0.3, 1.0, 0.0);
+    let rock = rock_image(&pose, 0);
+    let image = GrayImage::from_raw(640, 480, rock.pixels.clone()).unwrap();
+    let cut = |left: u32, top: u32, side: u32| {
+        GrayImage::from_fn(side, side, |u, v| *image.get_pixel(left + u, top + v))
+    };
+    let (picture, window) = (cut(305, 225, 31), cut(290, 205, 64));
+    let method = MatchTemplateMethod::CrossCorrelationNormalized;
+    c.bench_function(
+        "imageproc: template 31 x 31, 64 x 64 window, whole px",
+        |b| {
+            b.iter(|| find_extremes(&match_template(&window, &picture, method)));
+        },
+    );
+    c.bench_function("imageproc: FAST-9 corners, whole image", |b| {
+        b.iter(|| imageproc::corners::corners_fast9(&image, 20));
+    });
+    let mut slow = c.benchmark_group("imageproc");
+    slow.sample_size(10);
+    slow.bench_function("template 31 x 31, whole image, whole px", |b| {
+        b.iter(|| find_extremes(&match_template(&image, &picture, method)));
+    });
+}
+
+criterion_group!(benches, fiducial, template, stereo, peer);
 criterion_main!(benches);

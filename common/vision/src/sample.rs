@@ -92,6 +92,65 @@ fn spline_weights(t: f32) -> [f32; 4] {
     ]
 }
 
+/// One row of a grid of samples: the first place and the step, px from `base`.
+struct Line {
+    at: [f32; 2],
+    step: [f32; 2],
+    base: [i32; 2],
+}
+
+/// Samples `i..i + 4` of a chunk from 4 x 4 coefficients each.
+///
+/// # Safety
+/// From each of `starts[i..i + 4]` four rows of four values must follow, the rows `width` apart;
+/// `i + 4` is at most [`CHUNK`].
+#[inline(always)]
+unsafe fn weigh(
+    values: &[f32],
+    width: usize,
+    starts: &[i32; CHUNK],
+    i: usize,
+    wus: &[[f32; CHUNK]; 4],
+    wvs: &[[f32; CHUNK]; 4],
+    samples: &mut [f32; CHUNK],
+) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{
+            _MM_TRANSPOSE4_PS, _mm_add_ps, _mm_loadu_ps, _mm_mul_ps, _mm_set1_ps, _mm_storeu_ps,
+        };
+        // SAFETY: SSE belongs to every x86-64; the caller guarantees that the reads are inside.
+        unsafe {
+            let column = |s: usize| {
+                let first = values.as_ptr().add(starts[i + s] as usize);
+                let row = |k: usize| {
+                    let weight = _mm_set1_ps(*wvs[k].get_unchecked(i + s));
+                    _mm_mul_ps(weight, _mm_loadu_ps(first.add(k * width)))
+                };
+                _mm_add_ps(_mm_add_ps(_mm_add_ps(row(0), row(1)), row(2)), row(3))
+            };
+            let (mut a, mut b, mut c, mut d) = (column(0), column(1), column(2), column(3));
+            _MM_TRANSPOSE4_PS(&mut a, &mut b, &mut c, &mut d);
+            let part = |k: usize, x| _mm_mul_ps(x, _mm_loadu_ps(wus[k].as_ptr().add(i)));
+            let sum = _mm_add_ps(
+                _mm_add_ps(part(0, a), part(1, b)),
+                _mm_add_ps(part(2, c), part(3, d)),
+            );
+            _mm_storeu_ps(samples.as_mut_ptr().add(i), sum);
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    for k in i..i + 4 {
+        let start = starts[k] as usize;
+        let column = |x: usize| {
+            let row = |j: usize| wvs[j][k] * values[start + j * width + x];
+            ((row(0) + row(1)) + row(2)) + row(3)
+        };
+        samples[k] = (column(0) * wus[0][k] + column(1) * wus[1][k])
+            + (column(2) * wus[2][k] + column(3) * wus[3][k]);
+    }
+}
+
 /// Derivatives of [`spline_weights`].
 #[inline(always)]
 fn spline_slopes(t: f32) -> [f32; 4] {
@@ -215,50 +274,74 @@ impl SplineImage {
                 return false;
             }
         }
-        let width = self.width();
-        let values = self.coefficients.values();
-        let (max_u, max_v) = (width as i32 - 3, self.height() as i32 - 3);
+        if self.width() < 4 || self.height() < 4 {
+            return false;
+        }
         // relative to the first sample's pixel, so that single precision holds 1e-5 px
         let base = [origin[0].floor(), origin[1].floor()];
-        let (base_u, base_v) = (base[0] as i32, base[1] as i32);
-        let (su, sv) = (step_u[0] as f32, step_u[1] as f32);
-        for (j, line) in out.chunks_exact_mut(columns).take(rows).enumerate() {
-            let u0 = (origin[0] - base[0] + j as f64 * step_v[0]) as f32;
-            let v0 = (origin[1] - base[1] + j as f64 * step_v[1]) as f32;
-            for (c, chunk) in line.chunks_mut(CHUNK).enumerate() {
-                // indices and weights of a whole chunk in arrays, which the compiler turns into
-                // vectors; then one sample after the other
-                let (mut ius, mut ivs) = ([0i32; CHUNK], [0i32; CHUNK]);
-                let mut wus = [[0.0f32; CHUNK]; 4];
-                let mut wvs = [[0.0f32; CHUNK]; 4];
-                for i in 0..CHUNK {
-                    let k = (c * CHUNK + i) as f32;
-                    let (u, v) = (u0 + k * su, v0 + k * sv);
-                    let iu = (near_floor(u) + base_u).clamp(1, max_u);
-                    let iv = (near_floor(v) + base_v).clamp(1, max_v);
-                    let wu = spline_weights(u - (iu - base_u) as f32);
-                    let wv = spline_weights(v - (iv - base_v) as f32);
-                    (ius[i], ivs[i]) = (iu, iv);
-                    for k in 0..4 {
-                        wus[k][i] = wu[k];
-                        wvs[k][i] = wv[k];
-                    }
-                }
-                for (i, o) in chunk.iter_mut().enumerate() {
-                    let start = (ivs[i] as usize - 1) * width + ius[i] as usize - 1;
-                    let mut columns4 = [0.0f32; 4];
-                    for (k, weights) in wvs.iter().enumerate() {
-                        let row = &values[start + k * width..start + k * width + 4];
-                        for (c, x) in columns4.iter_mut().zip(row) {
-                            *c += weights[i] * x;
-                        }
-                    }
-                    *o = (columns4[0] * wus[0][i] + columns4[1] * wus[1][i])
-                        + (columns4[2] * wus[2][i] + columns4[3] * wus[3][i]);
-                }
-            }
+        let lines = out.chunks_exact_mut(columns).take(rows).enumerate();
+        for (j, line) in lines {
+            let at = [0, 1].map(|k| (origin[k] - base[k] + j as f64 * step_v[k]) as f32);
+            let grid = Line {
+                at,
+                step: step_u.map(|x| x as f32),
+                base: base.map(|x| x as i32),
+            };
+            self.sample_line(&grid, line);
         }
         true
+    }
+
+    /// One row of a grid. The image has 4 x 4 px at least.
+    fn sample_line(&self, grid: &Line, out: &mut [f32]) {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            return unsafe { self.sample_line_avx2(grid, out) };
+        }
+        self.sample_line_plain(grid, out);
+    }
+
+    /// The same with wider vectors.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn sample_line_avx2(&self, grid: &Line, out: &mut [f32]) {
+        self.sample_line_plain(grid, out);
+    }
+
+    #[inline(always)]
+    fn sample_line_plain(&self, grid: &Line, out: &mut [f32]) {
+        let (width, height) = (self.width(), self.height());
+        let values = self.coefficients.values();
+        assert!(width >= 4 && height >= 4 && values.len() == width * height);
+        let (max_u, max_v) = (width as i32 - 3, height as i32 - 3);
+        for (c, chunk) in out.chunks_mut(CHUNK).enumerate() {
+            // first coefficients and weights of a whole chunk, then its samples, four at a time:
+            // all in arrays of fixed length, which the compiler turns into vectors
+            let mut starts = [0i32; CHUNK];
+            let (mut wus, mut wvs) = ([[0.0f32; CHUNK]; 4], [[0.0f32; CHUNK]; 4]);
+            for i in 0..CHUNK {
+                let k = (c * CHUNK + i) as f32;
+                let (u, v) = (grid.at[0] + k * grid.step[0], grid.at[1] + k * grid.step[1]);
+                let iu = (near_floor(u) + grid.base[0]).clamp(1, max_u);
+                let iv = (near_floor(v) + grid.base[1]).clamp(1, max_v);
+                let wu = spline_weights(u - (iu - grid.base[0]) as f32);
+                let wv = spline_weights(v - (iv - grid.base[1]) as f32);
+                starts[i] = (iv - 1) * width as i32 + iu - 1;
+                for k in 0..4 {
+                    wus[k][i] = wu[k];
+                    wvs[k][i] = wv[k];
+                }
+            }
+            let mut samples = [0.0f32; CHUNK];
+            for i in (0..CHUNK).step_by(4) {
+                // SAFETY: row and column of every start are held between 0 and size - 4 above, so
+                // that four rows of four coefficients follow, and i + 4 is at most CHUNK.
+                unsafe { weigh(values, width, &starts, i, &wus, &wvs, &mut samples) };
+            }
+            let n = chunk.len();
+            chunk.copy_from_slice(&samples[..n]);
+        }
     }
 
     /// Gradients exactly at the pixels (`iu`..) of row `iv`, all at least one pixel inside.

@@ -178,6 +178,25 @@ struct Sums {
     at_border: bool,
 }
 
+/// The first bit from `from` on that is set, or clear.
+#[inline]
+fn next_bit<const SET: bool>(words: &[u64], from: usize) -> Option<usize> {
+    let flipped = |word: u64| if SET { word } else { !word };
+    let first = flipped(*words.get(from / 64)?) >> (from % 64) << (from % 64);
+    let rest = words[from / 64 + 1..].iter().map(|&word| flipped(word));
+    std::iter::once(first)
+        .chain(rest)
+        .position(|word| word != 0)
+        .map(|k| {
+            let word = if k == 0 {
+                first
+            } else {
+                flipped(words[from / 64 + k])
+            };
+            (from / 64 + k) * 64 + word.trailing_zeros() as usize
+        })
+}
+
 /// Runs of a clipped window's pixels beyond the threshold, joined where they touch.
 fn label(image: &Image8, window: Window, rules: &BlobRules) -> Vec<Run> {
     let (w, h) = (window.width as usize, window.height as usize);
@@ -186,34 +205,27 @@ fn label(image: &Image8, window: Window, rules: &BlobRules) -> Vec<Run> {
     }
     let (tiles, thresholds) = thresholds(image, window, rules.min_contrast_dn.max(1));
     let mut runs: Vec<Run> = Vec::new();
-    let mut beyond = vec![false; w + 1];
+    // one bit per pixel, and clear ones behind the last
+    let mut beyond = vec![0u64; w / 64 + 1];
     let (mut above, mut above_end) = (0usize, 0usize);
     for y in 0..h {
         let row = &image.pixels
             [(window.top as usize + y) * image.width_px as usize + window.left as usize..][..w];
         let limits = &thresholds[y / TILE * tiles..][..tiles];
-        let tiles_of_row = row.chunks(TILE).zip(beyond.chunks_mut(TILE)).zip(limits);
-        for ((pixels, out), limit) in tiles_of_row {
-            for (o, &p) in out.iter_mut().zip(pixels) {
-                *o = match limit {
-                    Some(limit) if rules.dark => p < *limit,
-                    Some(limit) => p >= *limit,
-                    None => false,
-                };
+        beyond.fill(0);
+        for (t, (pixels, limit)) in row.chunks(TILE).zip(limits).enumerate() {
+            // nothing is below 0, nothing at 256
+            let limit = limit.map_or(if rules.dark { 0 } else { 256 }, u16::from);
+            let mut bits = 0u64;
+            for (k, &p) in pixels.iter().enumerate() {
+                bits |= u64::from((u16::from(p) < limit) == rules.dark) << k;
             }
+            beyond[t * TILE / 64] |= bits << (t * TILE % 64);
         }
-        beyond[w] = false;
         let first = runs.len();
         let mut x = 0;
-        while x < w {
-            if !beyond[x] {
-                x += 1;
-                continue;
-            }
-            let start = x;
-            while beyond[x] {
-                x += 1;
-            }
+        while let Some(start) = next_bit::<true>(&beyond, x) {
+            x = next_bit::<false>(&beyond, start).unwrap_or(w);
             let me = runs.len() as u32;
             runs.push(Run {
                 row: y as u32,

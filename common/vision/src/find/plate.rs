@@ -5,7 +5,8 @@
 //! matching pair of the layout; the map that explains most regions, refined to a homography, gives
 //! the pose from which the plate is then measured as usual.
 
-use std::collections::BTreeMap;
+use std::cmp::Reverse;
+use std::collections::BTreeSet;
 
 use nalgebra::{Isometry3, Matrix2, SMatrix, SVector, Vector2, Vector3};
 use rover_cameras::Camera;
@@ -77,6 +78,8 @@ const MAX_REGIONS: usize = 160;
 const NEIGHBOURS: usize = 5;
 /// Hypotheses that are measured.
 const MAX_MEASURED: usize = 3;
+/// Hypotheses whose pose is worked out, those with the most matches.
+const SETTLED: usize = 4 * MAX_MEASURED;
 
 fn measure(
     image: &Image8,
@@ -163,43 +166,70 @@ fn elliptic_regions(image: &Image8, rules: &DetectionRules) -> Vec<Region> {
         .collect()
 }
 
-/// Regions by cells of the image, for looking up what lies at a place.
+/// Regions by cells of the image, for looking up what lies at a place: a cell lists the regions
+/// that reach into it.
 struct Cells<'a> {
     regions: &'a [Region],
-    cells: BTreeMap<(i32, i32), Vec<usize>>,
+    columns: usize,
+    rows: usize,
+    /// Where the list of each cell begins in `listed`, and where the last one ends.
+    starts: Vec<usize>,
+    listed: Vec<usize>,
 }
 
 const CELL_PX: f64 = 16.0;
+/// Farthest that a region is looked up from its centre, in its own short radii.
+const REACH: f64 = 1.2;
 
 impl<'a> Cells<'a> {
     fn new(regions: &'a [Region]) -> Self {
-        let mut cells: BTreeMap<(i32, i32), Vec<usize>> = BTreeMap::new();
-        for (i, r) in regions.iter().enumerate() {
-            cells.entry(Self::cell(&r.centre)).or_default().push(i);
-        }
-        Self { regions, cells }
-    }
-
-    fn cell(p: &Vector2<f64>) -> (i32, i32) {
-        (
-            (p.x / CELL_PX).floor() as i32,
-            (p.y / CELL_PX).floor() as i32,
-        )
-    }
-
-    /// The region closest to a place, within its own short radius times `reach`.
-    fn at(&self, p: &Vector2<f64>, reach: f64) -> Option<usize> {
-        let (i, j) = Self::cell(p);
-        let mut best: Option<(f64, usize)> = None;
-        for y in j - 1..=j + 1 {
-            for x in i - 1..=i + 1 {
-                for &k in self.cells.get(&(x, y)).into_iter().flatten() {
-                    let r = &self.regions[k];
-                    let distance = (r.centre - p).norm() / r.short_px;
-                    if distance <= reach && best.is_none_or(|(d, _)| distance < d) {
-                        best = Some((distance, k));
-                    }
+        let extent = regions.iter().fold(Vector2::zeros(), |e: Vector2<f64>, r| {
+            e.sup(&(r.centre + Vector2::repeat(REACH * r.short_px)))
+        });
+        let count = |x: f64| (x / CELL_PX).floor() as usize + 1;
+        let (columns, rows) = (count(extent.x), count(extent.y));
+        let mut lists = vec![Vec::new(); columns * rows];
+        for (k, r) in regions.iter().enumerate() {
+            let range = |x: f64| {
+                let cell = |x: f64| (x / CELL_PX).floor().max(0.0) as usize;
+                cell(x - REACH * r.short_px)..=cell(x + REACH * r.short_px)
+            };
+            for j in range(r.centre.y) {
+                for i in range(r.centre.x) {
+                    lists[j * columns + i].push(k);
                 }
+            }
+        }
+        let mut starts = Vec::with_capacity(lists.len() + 1);
+        let mut listed = Vec::new();
+        for list in lists {
+            starts.push(listed.len());
+            listed.extend(list);
+        }
+        starts.push(listed.len());
+        Self {
+            regions,
+            columns,
+            rows,
+            starts,
+            listed,
+        }
+    }
+
+    /// The region closest to a place, within its own short radius times `reach`, which is at most
+    /// [`REACH`].
+    fn at(&self, p: &Vector2<f64>, reach: f64) -> Option<usize> {
+        let (x, y) = (p.x / CELL_PX, p.y / CELL_PX);
+        if !(x >= 0.0 && y >= 0.0 && x < self.columns as f64 && y < self.rows as f64) {
+            return None;
+        }
+        let cell = y as usize * self.columns + x as usize;
+        let mut best: Option<(f64, usize)> = None;
+        for &k in &self.listed[self.starts[cell]..self.starts[cell + 1]] {
+            let r = &self.regions[k];
+            let distance = (r.centre - p).norm() / r.short_px;
+            if distance <= reach && best.is_none_or(|(d, _)| distance < d) {
+                best = Some((distance, k));
             }
         }
         best.map(|(_, k)| k)
@@ -209,13 +239,18 @@ impl<'a> Cells<'a> {
 /// The `count` places nearest to each place, nearest first.
 fn nearest(places: &[Vector2<f64>], count: usize) -> Vec<Vec<usize>> {
     let mut all = Vec::with_capacity(places.len());
+    let mut near: Vec<(f64, usize)> = Vec::with_capacity(count + 1);
     for (i, p) in places.iter().enumerate() {
-        let mut others: Vec<(f64, usize)> = (0..places.len())
-            .filter(|&j| j != i)
-            .map(|j| ((places[j] - p).norm_squared(), j))
-            .collect();
-        others.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        all.push(others.into_iter().take(count).map(|(_, j)| j).collect());
+        near.clear();
+        for (j, q) in places.iter().enumerate().filter(|(j, _)| *j != i) {
+            let distance = (q - p).norm_squared();
+            if near.len() == count && near.last().is_some_and(|last| last.0 <= distance) {
+                continue;
+            }
+            near.insert(near.partition_point(|n| n.0 <= distance), (distance, j));
+            near.truncate(count);
+        }
+        all.push(near.iter().map(|n| n.1).collect());
     }
     all
 }
@@ -232,7 +267,8 @@ fn hypotheses(regions: &[Region], camera: &Camera, layout: &PlateLayout) -> Vec<
     let centres: Vec<Vector2<f64>> = regions.iter().map(|r| r.centre).collect();
     let (in_layout, in_image) = (nearest(&discs, NEIGHBOURS), nearest(&centres, NEIGHBOURS));
     let cells = Cells::new(regions);
-    let mut found: Vec<Matches> = Vec::new();
+    // the most matches first
+    let mut found: BTreeSet<(Reverse<usize>, Matches)> = BTreeSet::new();
     for (a, region) in regions.iter().enumerate() {
         for &b in &in_image[a] {
             let other = &regions[b];
@@ -258,25 +294,32 @@ fn hypotheses(regions: &[Region], camera: &Camera, layout: &PlateLayout) -> Vec<
                     map *= radius * seen_length / length;
                     let place = |d: &Vector2<f64>| region.centre + map * (d - disc);
                     // three neighbours first: most hypotheses end here
-                    let quick = in_layout[i]
-                        .iter()
-                        .filter(|&&k| cells.at(&place(&discs[k]), 1.0).is_some())
-                        .count();
-                    if quick < 3 {
+                    let (mut met, mut missed) = (0, 0);
+                    for &k in &in_layout[i] {
+                        match cells.at(&place(&discs[k]), 1.0) {
+                            Some(_) => met += 1,
+                            None => missed += 1,
+                        }
+                        if met >= 3 || missed + 3 > in_layout[i].len() {
+                            break;
+                        }
+                    }
+                    if met < 3 {
                         continue;
                     }
-                    let matches = matching(&cells, &discs, &place, 1.2);
+                    let matches = matching(&cells, &discs, &place, REACH);
                     if matches.len() >= MIN_MATCHES - 2 {
-                        found.push(matches);
+                        found.insert((Reverse(matches.len()), matches));
+                        if found.len() > SETTLED {
+                            found.pop_last();
+                        }
                     }
                 }
             }
         }
     }
-    found.sort_by(|a, b| b.len().cmp(&a.len()).then_with(|| a.cmp(b)));
-    found.dedup();
     let mut poses: Vec<(usize, f64, Isometry3<f64>)> = Vec::new();
-    for matches in found.into_iter().take(4 * MAX_MEASURED) {
+    for (_, matches) in found {
         if let Some(one) = settle(&cells, &discs, camera, matches) {
             poses.push(one);
         }
@@ -324,7 +367,7 @@ fn settle(
     }
     let map = normal.cholesky()?.solve(&right);
     let by_affine = |d: &Vector2<f64>| map.transpose() * Vector3::new(d.x, d.y, 1e-2);
-    let wider = matching(cells, discs, &by_affine, 1.2);
+    let wider = matching(cells, discs, &by_affine, REACH);
     if wider.len() > matches.len() {
         matches = wider;
     }

@@ -1,14 +1,14 @@
 //! The crossing of two edges: a checker's corner, standing alone.
 //!
 //! Candidates are the maxima of -det(Hessian) of the smoothed image, where the image is a saddle
-//! surface; each is then fitted by the product of two blurred edges,
+//! surface; each is then fitted by the blurred crossing of two edges, for edges at right angles
 //! value = E(n1.d / s) E(n2.d / s), E(x) = 2 Phi(x) - 1, with both edge directions, the blur s and
-//! the centre free. The model is even under d -> -d, so that unequal light over the window and the
-//! approximation of a skew crossing's blur move the centre only in second order.
+//! the centre free. The model is even under d -> -d, so that unequal light over the window moves the
+//! centre only in second order.
 
 use serde::{Deserialize, Serialize};
 
-use super::pixels::{PixelModel, fit_pixels, fit_rules, noise_dn};
+use super::pixels::{FitRules, PixelModel, fit_pixels, fit_rules, noise_dn};
 use super::{Finding, NoFinding, cut, positive};
 use crate::fiducial::normal_at;
 use crate::image::{Image8, ImageF};
@@ -24,6 +24,9 @@ pub struct SaddleRules {
     pub smoothing_px: f64,
     /// Least difference between light and dark quadrants, DN.
     pub min_contrast_dn: f64,
+    /// Least such difference in units of the image's grey noise: below it noise hides what tells a
+    /// crossing from chance.
+    pub min_contrast_to_noise: f64,
     /// Least correlation of model and image.
     pub min_score: f64,
     /// Largest rms difference between model and image beyond the image's own noise, as a fraction of
@@ -51,8 +54,9 @@ impl Default for SaddleRules {
             window_px: 8.0,
             smoothing_px: 1.5,
             min_contrast_dn: 20.0,
+            min_contrast_to_noise: 17.0,
             min_score: 0.93,
-            max_residual_fraction: 0.035,
+            max_residual_fraction: 0.025,
             noise_dn: 6.0,
             min_sine: 0.35,
             max_blur_px: 1.6,
@@ -70,6 +74,7 @@ impl SaddleRules {
             ("window_px", self.window_px - 3.0),
             ("smoothing_px", self.smoothing_px),
             ("min_contrast_dn", self.min_contrast_dn),
+            ("min_contrast_to_noise", self.min_contrast_to_noise),
             ("min_score", self.min_score),
             ("max_residual_fraction", self.max_residual_fraction),
             ("noise_dn", self.noise_dn),
@@ -95,6 +100,45 @@ struct Crossing {
 
 const MIN_BLUR_PX: f64 = 0.3;
 
+/// One blurred edge at a pixel: 2 Phi(z) - 1, z being the distance in blurs, with phi(z) and the
+/// derivatives of z by u, v, turn and blur.
+struct Edge {
+    n: [f64; 2],
+    z: f64,
+    value: f64,
+    density: f64,
+    by: [f64; 4],
+}
+
+/// What a blurred crossing has beside the product of its blurred edges unless they are at right
+/// angles: the expectation of sign(x) sign(y) over the bivariate normal distribution with the
+/// edges' distances as means and c = n1.n2 as correlation is the product plus
+/// 4 phi(z1) phi(z2) (c + c^2/2 z1 z2 + c^3/6 (z1^2 - 1)(z2^2 - 1) + ...) (Mehler's series).
+struct Skew {
+    value: f64,
+    /// Derivatives by z1, z2 and c.
+    by_a: f64,
+    by_b: f64,
+    by_cosine: f64,
+}
+
+impl Skew {
+    fn of(a: &Edge, b: &Edge) -> Self {
+        let c = a.n[0] * b.n[0] + a.n[1] * b.n[1];
+        let density = 4.0 * a.density * b.density;
+        let (x, y) = (a.z, b.z);
+        let (xx, yy) = (x * x - 1.0, y * y - 1.0);
+        let (c2, c3) = (0.5 * c * c, c * c * c / 6.0);
+        let sum = c + c2 * x * y + c3 * xx * yy;
+        Self {
+            value: density * sum,
+            by_a: density * (c2 * y + c3 * 2.0 * x * yy - x * sum),
+            by_b: density * (c2 * x + c3 * 2.0 * y * xx - y * sum),
+            by_cosine: density * (1.0 + c * x * y + 0.5 * c * c * xx * yy),
+        }
+    }
+}
+
 impl Crossing {
     /// The normal turned by a tangent t: (n + t n') / |...|.
     fn turned(&self, which: usize, t: f64) -> [f64; 2] {
@@ -114,33 +158,45 @@ impl PixelModel<5> for Crossing {
         }
         let edge = |which: usize, t: f64| {
             let n = self.turned(which, t);
-            let distance = n[0] * du + n[1] * dv;
-            let z = distance / p[4];
+            let z = (n[0] * du + n[1] * dv) / p[4];
             let (below, density) = normal_at(z as f32);
-            let value = 2.0 * f64::from(below) - 1.0;
-            let rate = 2.0 * f64::from(density) / p[4];
-            let turn = (-n[1] * du + n[0] * dv) / (1.0 + t * t);
-            (value, [-rate * n[0], -rate * n[1], rate * turn, -rate * z])
+            // change of z with the centre and with the turn
+            let turn = (-n[1] * du + n[0] * dv) / (1.0 + t * t) / p[4];
+            Edge {
+                n,
+                z,
+                value: 2.0 * f64::from(below) - 1.0,
+                density: f64::from(density),
+                by: [-n[0] / p[4], -n[1] / p[4], turn, -z / p[4]],
+            }
         };
-        let (a, da) = edge(0, p[2]);
-        let (b, db) = edge(1, p[3]);
+        let (a, b) = (edge(0, p[2]), edge(1, p[3]));
+        let skew = Skew::of(&a, &b);
+        let (by_a, by_b) = (
+            2.0 * a.density * b.value + skew.by_a,
+            2.0 * b.density * a.value + skew.by_b,
+        );
+        // turning a normal changes the cosine of both by the sine between them
+        let sine = a.n[0] * b.n[1] - a.n[1] * b.n[0];
         *slopes = [
-            da[0] * b + a * db[0],
-            da[1] * b + a * db[1],
-            da[2] * b,
-            a * db[2],
-            da[3] * b + a * db[3],
+            by_a * a.by[0] + by_b * b.by[0],
+            by_a * a.by[1] + by_b * b.by[1],
+            by_a * a.by[2] + skew.by_cosine * sine / (1.0 + p[2] * p[2]),
+            by_b * b.by[2] - skew.by_cosine * sine / (1.0 + p[3] * p[3]),
+            by_a * a.by[3] + by_b * b.by[3],
         ];
-        (a * b, weight)
+        (a.value * b.value + skew.value, weight)
     }
 
     /// Each edge bent (t^2), kinked (|t|) and bent to an S (t^3), its blur different from the other's
-    /// and changing along it, t from -1 to 1 over the window; quadrants of unequal grey (in units of
-    /// the contrast); a gap or a neck at the crossing.
-    const DEFORMATIONS: usize = 12;
-    const GRANTED_PX: f64 = 0.12;
-    /// With a dozen deformations a crossing itself exceeds this once in some ten thousand.
-    const MAX_DEFORMATION: f64 = 1.8;
+    /// and changing along it, t from -1 to 1 over the window; both more blurred away from the
+    /// crossing than at it; quadrants of unequal grey (in units of the contrast); a gap or a neck at
+    /// the crossing.
+    const DEFORMATIONS: usize = 13;
+    const GRANTED_PX: f64 = 0.07;
+    /// Of crossings one in a hundred exceeds this; of the places where two dark patches of
+    /// thresholded texture meet corner to corner and which pass with 2.5, all but one in fifty.
+    const MAX_DEFORMATION: f64 = 1.15;
 
     fn deform(&self, p: &[f64; 5], u: f64, v: f64, out: &mut [f64]) {
         let (du, dv) = (u - p[0], v - p[1]);
@@ -164,6 +220,7 @@ impl PixelModel<5> for Crossing {
             blur_a * b - blur_b * a,
             blur_a * b * s,
             blur_b * a * t,
+            blur_a * b * s.abs() + blur_b * a * t.abs(),
             a,
             b,
             rate_a * rate_b * p[4],
@@ -324,13 +381,13 @@ fn fit(
     if sine < rules.min_sine {
         return Err(skew(sine));
     }
-    let sigma_px = found.check(
-        image,
-        &model,
-        contrast_dn,
-        noise_dn,
-        &fit_rules!(rules, rules.max_blur_px),
-    )?;
+    let limits = fit_rules!(rules, rules.max_blur_px);
+    let over_noise_dn = rules.min_contrast_to_noise * noise_dn.min(rules.noise_dn);
+    let limits = FitRules {
+        min_contrast_dn: rules.min_contrast_dn.max(over_noise_dn),
+        ..limits
+    };
+    let sigma_px = found.check(image, &model, contrast_dn, noise_dn, &limits)?;
     Ok(Finding::at(p[0], p[1], found.score, sigma_px))
 }
 
@@ -366,3 +423,7 @@ pub fn saddle(
     }
     Ok(distinct)
 }
+
+#[cfg(test)]
+#[path = "saddle_tests.rs"]
+mod tests;

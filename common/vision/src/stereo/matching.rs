@@ -256,7 +256,7 @@ pub(super) fn match_checked(
     Ok(found)
 }
 
-/// Fits one candidate of the search; where noise keeps the window from settling, the widest one.
+/// Fits one candidate of the search.
 fn fit(
     (a, b): (&Camera, &Camera),
     (left, right): (&PreparedImage, &PreparedImage),
@@ -274,17 +274,29 @@ fn fit(
         slopes: slopes.unwrap_or_else(Vector2::zeros),
         across_px: 0.0,
     };
-    let unsettled = match refine(window, right, &link, start, rules) {
+    let refined = settle((left, right), left_px, window, &link, start, rules)?;
+    Ok((link, refined))
+}
+
+/// Fits a window from a start; where noise keeps it from settling, the widest one.
+pub(super) fn settle(
+    (left, right): (&PreparedImage, &PreparedImage),
+    left_px: &Vector2<f64>,
+    window: &LeftWindow,
+    link: &Link,
+    start: Displacement,
+    rules: &MatchRules,
+) -> Result<Refined, MatchFailure> {
+    let unsettled = match refine(window, right, link, start, rules) {
         Err(e @ (MatchFailure::Diverged { .. } | MatchFailure::TooSteep { .. })) => e,
-        done => return Ok((link, done?)),
+        done => return done,
     };
     let widest = rules.max_half_window_px as usize;
     if widest <= window.half || window.signal_part(left.noise_dn().powi(2)) > LITTLE_NOISE {
         return Err(unsettled);
     }
     let wide = LeftWindow::new(left, left_px, widest).ok_or(unsettled)?;
-    let refined = refine(&wide, right, &link, start, rules)?;
-    Ok((link, refined))
+    refine(&wide, right, link, start, rules)
 }
 
 /// Windows are not held back by noise if this part of their variance is signal.
@@ -296,7 +308,7 @@ const AGREEMENT_PX: f64 = 0.02;
 const MAX_RESIDUAL_RATIO: f64 = 1.15;
 
 /// The same fit over a window large enough for the aimed certainty, if the surface allows it.
-fn widened(
+pub(super) fn widened(
     link: &Link,
     narrow: &Refined,
     (left, right): (&PreparedImage, &PreparedImage),

@@ -36,6 +36,8 @@ pub(super) struct Refined {
     pub residual_dn: f64,
     /// Standard deviations of the left and the right window, DN.
     pub deviations_dn: [f64; 2],
+    /// Side of the window, px.
+    pub side_px: usize,
 }
 
 const MAX_STEPS: usize = 20;
@@ -43,6 +45,9 @@ const MAX_STEPS: usize = 20;
 const FULL_STEPS: usize = 8;
 /// A fit has settled when a step moves window middle and edges by less, px.
 const SETTLED_PX: f64 = 0.002;
+/// Below this a step settles the fit too if all that would follow, to judge by the last two, add
+/// up to less than a settled one.
+const NEARLY_SETTLED_PX: f64 = 0.01;
 /// Slopes that change by more than this since the derivatives were taken have them taken anew.
 const RELINEARISE_SLOPE: f64 = 0.03;
 /// Grey noise assumed when the offset across the curve is held, DN.
@@ -66,6 +71,7 @@ struct Derivatives {
 }
 
 impl Derivatives {
+    #[inline(always)]
     fn new(
         window: &LeftWindow,
         gradients: &Gradients,
@@ -136,6 +142,35 @@ pub(super) fn refine(
     start: Displacement,
     rules: &MatchRules,
 ) -> Result<Refined, MatchFailure> {
+    #[cfg(target_arch = "x86_64")]
+    if std::arch::is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has AVX2.
+        return unsafe { refine_avx2(window, right, link, start, rules) };
+    }
+    refine_plain(window, right, link, start, rules)
+}
+
+/// The same with wider vectors.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn refine_avx2(
+    window: &LeftWindow,
+    right: &PreparedImage,
+    link: &Link,
+    start: Displacement,
+    rules: &MatchRules,
+) -> Result<Refined, MatchFailure> {
+    refine_plain(window, right, link, start, rules)
+}
+
+#[inline(always)]
+fn refine_plain(
+    window: &LeftWindow,
+    right: &PreparedImage,
+    link: &Link,
+    start: Displacement,
+    rules: &MatchRules,
+) -> Result<Refined, MatchFailure> {
     let hold = (ASSUMED_NOISE_DN / rules.epipolar_sigma_px).powi(2);
     let singular = || MatchFailure::NoTexture {
         found_dn: window.deviation_dn,
@@ -148,11 +183,16 @@ pub(super) fn refine(
     let mut padded = vec![0.0f32; window.values.len()];
     let mut quieter: Option<Gradients> = None;
     let mut is_noise_settled = false;
-    let linearised = |gradients: &Gradients, slopes: Vector2<f64>| {
-        Derivatives::new(window, gradients, link, slopes, hold).ok_or_else(singular)
-    };
-    let mut derivatives = linearised(&window.exact, now.slopes)?;
+    let mut last_size = 0.0;
+    let mut derivatives: Option<Derivatives> = None;
     for taken in 0..MAX_STEPS {
+        let gradients = quieter.as_ref().unwrap_or(&window.exact);
+        let derived = match derivatives.take() {
+            Some(kept) => kept,
+            None => {
+                Derivatives::new(window, gradients, link, now.slopes, hold).ok_or_else(singular)?
+            }
+        };
         let matrix = link.matrix(&now.slopes);
         let origin = link.at
             + matrix * window.first
@@ -170,7 +210,7 @@ pub(super) fn refine(
             return Err(MatchFailure::CurveOutsideImage);
         }
         window.pad(&samples, &mut padded);
-        let d = &derivatives.planes;
+        let d = &derived.planes;
         let (cross, sum) = (dot(&window.values, &padded), dot(&window.ones, &padded));
         let mut right_side = SVector::<f64, 6>::from([
             dot(&d[0], &padded),
@@ -181,7 +221,7 @@ pub(super) fn refine(
             sum,
         ]);
         right_side[3] += now.across_px * hold;
-        let x = derivatives.factor.solve(&right_side);
+        let x = derived.factor.solve(&right_side);
         let gain = x[4];
         if !(gain >= MIN_GAIN) {
             return Err(MatchFailure::LowScore {
@@ -194,16 +234,14 @@ pub(super) fn refine(
         let square = dot(&padded, &padded);
         let residual = (square - x.dot(&right_side)).max(0.0) / (n - 6.0);
         let noise_square = residual / (1.0 + gain * gain);
-        let gradients = quieter.as_ref().unwrap_or(&window.exact);
-        let along = &derivatives.along;
+        let along = &derived.along;
         let inflation = window.inflation(&d[0], gradients, along, noise_square);
         // the noise of the left values takes as much from the gain
         let gain = gain / window.signal_part(noise_square);
         if !is_noise_settled && inflation > NOISY && taken >= FIRST_STEPS {
             is_noise_settled = true;
             quieter = window.quieter_gradients(noise_square);
-            if let Some(gradients) = &quieter {
-                derivatives = linearised(gradients, now.slopes)?;
+            if quieter.is_some() {
                 continue;
             }
         }
@@ -239,10 +277,15 @@ pub(super) fn refine(
             .abs()
             .max(step.across_px.abs())
             .max(half * step.slopes.amax());
-        if size < SETTLED_PX {
+        let shrinking = size / last_size;
+        let is_next_settled = shrinking < 1.0
+            && size < NEARLY_SETTLED_PX
+            && size * shrinking < SETTLED_PX * (1.0 - shrinking);
+        last_size = size;
+        if size < SETTLED_PX || is_next_settled {
             let variance = square - sum * sum / n;
             let score = cross / (window.square * variance).sqrt();
-            let inverse = derivatives.factor.inverse();
+            let inverse = derived.factor.inverse();
             let sigma = (residual.max(0.1) * inverse[(0, 0)]).sqrt() * inflation / gain;
             return Ok(Refined {
                 displacement: now,
@@ -250,10 +293,11 @@ pub(super) fn refine(
                 sigma_px: sigma.hypot(rules.sigma_floor_px),
                 residual_dn: residual.sqrt(),
                 deviations_dn: [window.deviation_dn, (variance / n).max(0.0).sqrt()],
+                side_px: window.side,
             });
         }
-        if (now.slopes - derivatives.slopes).amax() > RELINEARISE_SLOPE {
-            derivatives = linearised(quieter.as_ref().unwrap_or(&window.exact), now.slopes)?;
+        if (now.slopes - derived.slopes).amax() <= RELINEARISE_SLOPE {
+            derivatives = Some(derived);
         }
     }
     Err(MatchFailure::Diverged {

@@ -149,7 +149,9 @@ impl MatchRules {
 pub struct SurfaceRules {
     /// How single points are matched.
     pub matching: MatchRules,
-    /// Half the side of the window of the surrounding matches less half a pixel.
+    /// Half the side of the window of the surrounding matches less half a pixel; those that noise
+    /// leaves more uncertain than `matching.max_sigma_px` are widened up to
+    /// `matching.max_half_window_px`.
     pub half_window_px: u32,
     /// Matches are made at offsets up to this many steps from the pixel.
     pub half_grid: u32,

@@ -5,8 +5,8 @@ use nalgebra::{Matrix3, Unit, Vector2, Vector3};
 use rover_cameras::StereoPair;
 
 use super::link::Link;
-use super::matching::{accept, check_input, match_checked};
-use super::refine::{Displacement, refine};
+use super::matching::{accept, check_input, match_checked, settle, widened};
+use super::refine::Displacement;
 use super::surface_fit::{Sample, fit_centre, fit_patch};
 use super::window::LeftWindow;
 use super::{MatchFailure, MatchRules, PreparedImage, StereoMatch, SurfaceRules};
@@ -184,7 +184,9 @@ pub fn measure_surface(
         });
     }
     check_quadrants(&first_guess, rules)?;
-    let side = f64::from(2 * rules.half_window_px + 1);
+    // windows that noise has widened count with their own size
+    let sides: f64 = first_guess.iter().map(|s| s.side_px).sum();
+    let side = sides / first_guess.len() as f64;
     let window_variance = (side * side - 1.0) / 12.0;
     let reach = f64::from(rules.half_grid) * rules.grid_step_px;
     let centre = fit_centre(&first_guess, reach, window_variance)
@@ -345,6 +347,7 @@ impl Grid {
         order.sort_by_key(|&(i, j)| (i * i + j * j, j, i));
         let matching = MatchRules {
             half_window_px: rules.half_window_px,
+            aim_sigma_px: AIMED_PART * rules.matching.max_sigma_px,
             ..rules.matching.clone()
         };
         let mut nodes: Vec<Option<Node>> = vec![None; side * side];
@@ -406,6 +409,9 @@ impl Grid {
     }
 }
 
+/// Windows that noise leaves too uncertain are widened to this part of the accepted deviation.
+const AIMED_PART: f64 = 0.6;
+
 /// Matches one grid place from a predicted inverse range and slopes; also its distance from the
 /// epipolar curve, px.
 #[allow(clippy::too_many_arguments)] // one inner step, called from one place
@@ -429,7 +435,12 @@ fn measure_node(
         slopes: slopes * link.px_per_inverse_range,
         across_px: 0.0,
     };
-    let found = refine(&window, right, &link, start, matching).ok()?;
+    let mut found = settle((left, right), pixel, &window, &link, start, matching).ok()?;
+    if found.sigma_px > matching.max_sigma_px
+        && let Some(wide) = widened(&link, &found, (left, right), pixel, matching)
+    {
+        found = wide;
+    }
     if found.displacement.along_px.abs() > rules.max_jump_px {
         return None;
     }
@@ -442,6 +453,7 @@ fn measure_node(
         inverse_range,
         sigma: found.sigma_px / link.px_per_inverse_range,
         point: ray_point,
+        side_px: found.side_px as f64,
     };
     Some((
         Node {

@@ -17,6 +17,8 @@ pub(super) struct Sample {
     pub sigma: f64,
     /// The point, cameras' frame, m.
     pub point: Vector3<f64>,
+    /// Side of the matched window, px.
+    pub side_px: f64,
 }
 
 /// The inverse range at the designated pixel.
