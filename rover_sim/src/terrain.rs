@@ -84,6 +84,15 @@ impl Terrain {
         self.bodies[0].mesh.positions[j * xs.len() + i].z
     }
 
+    /// Whether there is ground for `about_m` on all sides of a place.
+    pub(crate) fn has_about(&self, x: f64, y: f64, about_m: f64) -> bool {
+        let [xs, ys] = &self.grid_m;
+        let inside = |lines: &[f64], at: f64| {
+            lines[0] + about_m <= at && at <= lines[lines.len() - 1] - about_m
+        };
+        inside(xs, x) && inside(ys, y)
+    }
+
     /// Outward normal of a body within `radius_m` of a point, by area, not of unit length; `None` if
     /// there is no such body.
     pub(crate) fn mean_normal(

@@ -19,6 +19,8 @@ const HIGHEST_M: f64 = 0.30;
 /// Half the width of the field before the rover in which places are looked for, and where there is
 /// none, rad.
 const AHEAD_RAD: [f64; 2] = [0.5, 0.9];
+/// Nearer than this to an edge of the terrain nothing is picked: the rover must stand about it, m.
+const EDGE_M: f64 = 1.5;
 /// Rocks smaller than this are not picked, m.
 const ROCK_M: f64 = 0.10;
 
@@ -136,7 +138,9 @@ impl World {
                         && found.normal.z > 0.15
                 }
             };
+            let at = &found.point_m;
             if !fits
+                || !self.terrain.has_about(at.x, at.y, EDGE_M)
                 || !(near..=far).contains(&place.range_m)
                 || !self.is_lit(&found)
                 || !self.is_plain(&eye, &found, margin_rad)
