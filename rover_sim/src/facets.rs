@@ -178,12 +178,17 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_normal_of_a_ball_points_outwards() {
-        let mesh = shapes::rock(1, 0.5, 6, 0.0);
+    fn the_mean_normal_of_a_dome_is_the_normal_at_its_place() {
+        let dome = |x: f64, y: f64| -(x * x + y * y);
+        let lines: Vec<f64> = (0..=200).map(|i| 0.01 * f64::from(i) - 1.0).collect();
+        let mesh = shapes::heightfield_mesh(&lines, &lines, dome);
         let index = Facets::of(&mesh);
-        for way in [Vector3::x(), Vector3::new(0.6, 0.0, 0.8), Vector3::z()] {
-            let normal = index.mean_normal(&mesh, &(way * 0.5), 0.05);
-            assert!(normal.angle(&way) < 0.02, "{}", normal.angle(&way));
+        for (x, y) in [(0.0, 0.0), (0.3, 0.0), (-0.2, 0.25)] {
+            let place = Vector3::new(x, y, dome(x, y));
+            let expected = Vector3::new(2.0 * x, 2.0 * y, 1.0);
+            let normal = index.mean_normal(&mesh, &place, 0.05);
+            let apart = normal.angle(&expected);
+            assert!(apart < 0.01, "{x} {y}: {apart}");
         }
     }
 }
