@@ -19,8 +19,9 @@ const HIGHEST_M: f64 = 0.30;
 /// Half the width of the field before the rover in which places are looked for, and where there is
 /// none, rad.
 const AHEAD_RAD: [f64; 2] = [0.5, 0.9];
-/// Nearer than this to an edge of the terrain nothing is picked: the rover must stand about it, m.
-const EDGE_M: f64 = 1.5;
+/// Least distance of a picked place from the edge of the terrain, and where there is none, m: the
+/// rover must find a place to stand about it.
+const EDGES_M: [f64; 2] = [1.5, 0.8];
 /// Rocks smaller than this are not picked, m.
 const ROCK_M: f64 = 0.10;
 
@@ -102,11 +103,13 @@ impl World {
         let yaw = world_from_rover.rotation.euler_angles().2;
         let [near, far] = request.range_m;
         // A person looks ahead first, prefers the middle of a surface, and takes what there is.
-        let wishes = AHEAD_RAD
-            .into_iter()
-            .flat_map(|ahead| MARGINS_RAD.map(|margin| (ahead, margin)));
+        let wishes = EDGES_M.into_iter().flat_map(|edge| {
+            AHEAD_RAD
+                .into_iter()
+                .flat_map(move |ahead| MARGINS_RAD.map(|margin| (edge, ahead, margin)))
+        });
         let tried_n = wishes.clone().count() as u32 * TRIES;
-        for (ahead_rad, margin_rad) in wishes.flat_map(|w| (0..TRIES).map(move |_| w)) {
+        for (edge_m, ahead_rad, margin_rad) in wishes.flat_map(|w| (0..TRIES).map(move |_| w)) {
             let [u, v]: [f64; 2] = std::array::from_fn(|_| random.random());
             let range = near + u * (far - near);
             let azimuth = yaw + (2.0 * v - 1.0) * ahead_rad;
@@ -140,7 +143,7 @@ impl World {
             };
             let at = &found.point_m;
             if !fits
-                || !self.terrain.has_about(at.x, at.y, EDGE_M)
+                || !self.terrain.has_about(at.x, at.y, edge_m)
                 || !(near..=far).contains(&place.range_m)
                 || !self.is_lit(&found)
                 || !self.is_plain(&eye, &found, margin_rad)
