@@ -19,8 +19,9 @@ const RELIEF_REST: f64 = 0.5;
 const MATCH_FLOOR_PX: f64 = 0.05;
 /// Less than this is never claimed for all of tracking, px of the image in which the target was
 /// named, one sigma: matches from anchor to anchor share errors that none of them shows. Of 142
-/// placements 95 % had lost no more than 0.33 px on the way.
-const TRACKING_FLOOR_PX: f64 = 0.16;
+/// placements 95 % had lost no more than 0.33 px on the way. With 0.16 the servo's bound held in 76
+/// of 82 others.
+const TRACKING_FLOOR_PX: f64 = 0.18;
 /// What shape, cameras and body do besides, one sigma along the surface, m.
 const UNMODELLED_M: f64 = 0.5e-3;
 
