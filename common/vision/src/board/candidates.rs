@@ -12,11 +12,25 @@ const ABSOLUTE: f32 = 0.3;
 /// Radii of the ring that are tried, px.
 const RADII_PX: [f64; 3] = [4.0, 5.5, 7.5];
 const RING: usize = 32;
+/// How far from straight an edge may run through the ring, samples of the ring.
+const BEND: f32 = 2.0;
+/// How far from the middle of dark and bright the crossing itself may be, as a part of the swing:
+/// between two things that only come close to each other it is as bright as the gap.
+const OFF_MIDDLE: f32 = 0.25;
 /// Least swing of the ring, DN.
 const MIN_SWING: f32 = 8.0;
 
-/// Saddle points, strongest first, at most `most`.
-pub(super) fn saddles(smooth: &ImageF, most: usize) -> Vec<Vector2<f64>> {
+/// A point where dark and bright cross.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Crossing {
+    /// Where, px of the picture searched.
+    pub(super) at: Vector2<f64>,
+    /// Swing of the ring around it, DN.
+    pub(super) swing: f64,
+}
+
+/// Crossings, strongest saddle first, at most `most`.
+pub(super) fn saddles(smooth: &ImageF, most: usize) -> Vec<Crossing> {
     let (w, h) = (smooth.width(), smooth.height());
     if w < 8 || h < 8 {
         return Vec::new();
@@ -54,38 +68,54 @@ pub(super) fn saddles(smooth: &ImageF, most: usize) -> Vec<Vector2<f64>> {
     peaks.sort_by(|a, b| b.0.total_cmp(&a.0).then((a.2, a.1).cmp(&(b.2, b.1))));
     peaks
         .into_iter()
-        .map(|(_, u, v)| Vector2::new(u as f64, v as f64))
-        .filter(|p| is_crossing(smooth, p))
+        .filter_map(|(_, u, v)| crossing(smooth, Vector2::new(u as f64, v as f64)))
         .take(most)
         .collect()
 }
 
-/// Whether a ring around the point is dark, bright, dark, bright, opposite sides alike.
-pub(super) fn is_crossing(smooth: &ImageF, at: &Vector2<f64>) -> bool {
-    RADII_PX.iter().any(|radius| {
+/// The point as a crossing, if a ring around it is dark, bright, dark, bright, opposite sides alike.
+fn crossing(smooth: &ImageF, at: Vector2<f64>) -> Option<Crossing> {
+    let here = bilinear(smooth, at.x, at.y)?.value;
+    RADII_PX.iter().find_map(|radius| {
         let mut ring = [0.0_f32; RING];
         for (i, value) in ring.iter_mut().enumerate() {
             let (sine, cosine) = (TAU * i as f64 / RING as f64).sin_cos();
-            match bilinear(smooth, at.x + radius * cosine, at.y + radius * sine) {
-                Some(sample) => *value = sample.value,
-                None => return false,
-            }
+            *value = bilinear(smooth, at.x + radius * cosine, at.y + radius * sine)?.value;
         }
         let (low, high) = ring
             .iter()
             .fold((f32::MAX, f32::MIN), |(l, h), x| (l.min(*x), h.max(*x)));
         let swing = high - low;
         if !(swing > MIN_SWING) {
-            return false;
+            return None;
         }
         let middle = 0.5 * (low + high);
-        let changes = (0..RING)
-            .filter(|i| (ring[*i] > middle) != (ring[(i + 1) % RING] > middle))
-            .count();
+        let changes = changes(&ring, middle)?;
+        // Each edge goes straight through: it leaves the ring opposite to where it entered.
+        let straight =
+            (0..2).all(|i| (changes[i + 2] - changes[i] - 0.5 * RING as f32).abs() < BEND);
         let opposite: f32 = (0..RING / 2)
             .map(|i| (ring[i] - ring[i + RING / 2]).abs())
             .sum::<f32>()
             / (RING / 2) as f32;
-        changes == 4 && opposite < 0.3 * swing
+        let between = (here - middle).abs() < OFF_MIDDLE * swing;
+        (straight && between && opposite < 0.3 * swing).then_some(Crossing {
+            at,
+            swing: f64::from(swing),
+        })
     })
+}
+
+/// Where on the ring it changes between dark and bright, in samples, if it does so four times.
+fn changes(ring: &[f32; RING], middle: f32) -> Option<[f32; 4]> {
+    let mut places = [0.0; 4];
+    let mut found = 0;
+    for i in 0..RING {
+        let (a, b) = (ring[i] - middle, ring[(i + 1) % RING] - middle);
+        if (a > 0.0) != (b > 0.0) {
+            *places.get_mut(found)? = i as f32 + a / (a - b);
+            found += 1;
+        }
+    }
+    (found == 4).then_some(places)
 }

@@ -1,5 +1,6 @@
 //! From scattered crossings to the board's grid.
 
+use super::candidates::Crossing;
 use super::refine::Refined;
 use super::{BoardCorner, Chessboard};
 use crate::image::ImageF;
@@ -15,21 +16,25 @@ const AROUND: usize = 10;
 const REACH: f64 = 0.3;
 /// Least contrast across an edge, DN.
 const MIN_EDGE: f64 = 6.0;
+/// Least ratio of the swings of two neighbouring corners: light changes slowly over a board.
+const ALIKE: f64 = 0.5;
 
 type Cell = (i32, i32);
 
 /// A grid that grows; places are in the level's pixels.
 struct Growing<'a> {
     smooth: &'a ImageF,
-    points: &'a [Vector2<f64>],
+    points: &'a [Crossing],
     cells: BTreeMap<Cell, usize>,
     taken: Vec<bool>,
+    /// Bright on the left of the edge from cell (0, 0) to (1, 0).
+    bright_left: bool,
 }
 
 /// The board's corners row by row; or how many corners of which extent the largest grid had.
 pub(super) fn grow(
     smooth: &ImageF,
-    points: &[Vector2<f64>],
+    points: &[Crossing],
     board: Chessboard,
 ) -> Result<Vec<Vector2<f64>>, (usize, [usize; 2])> {
     let mut largest = (0, [0, 0]);
@@ -41,12 +46,13 @@ pub(super) fn grow(
             continue;
         }
         tried += 1;
-        for (right, down) in neighbours(smooth, points, seed) {
+        for (right, down, bright_left) in neighbours(smooth, points, seed) {
             let mut grid = Growing {
                 smooth,
                 points,
                 cells: BTreeMap::from([((0, 0), seed), ((1, 0), right), ((0, 1), down)]),
                 taken: vec![false; points.len()],
+                bright_left,
             };
             for at in [seed, right, down] {
                 grid.taken[at] = true;
@@ -54,6 +60,16 @@ pub(super) fn grow(
             grid.spread(2 * board.columns.max(board.rows));
             if let Some(corners) = grid.board(board) {
                 return Ok(corners);
+            }
+            if grid.cells.len() > largest.0 && std::env::var("DBG").is_ok() {
+                for (c, i) in &grid.cells {
+                    eprintln!(
+                        "{c:?} {:?} {}",
+                        grid.points[*i].at.as_slice(),
+                        grid.points[*i].swing
+                    );
+                }
+                eprintln!();
             }
             if grid.cells.len() > largest.0 {
                 largest = (grid.cells.len(), grid.extent());
@@ -68,39 +84,41 @@ pub(super) fn grow(
     Err(largest)
 }
 
-/// Pairs of candidates that may be the right and the lower neighbour of a seed.
-fn neighbours(smooth: &ImageF, points: &[Vector2<f64>], seed: usize) -> Vec<(usize, usize)> {
-    let here = points[seed];
+/// Pairs of candidates that may be the right and the lower neighbour of a seed, and whether the
+/// edge to the first is bright on its left.
+fn neighbours(smooth: &ImageF, points: &[Crossing], seed: usize) -> Vec<(usize, usize, bool)> {
+    let here = points[seed].at;
     let mut near: Vec<(f64, usize)> = points
         .iter()
         .enumerate()
         .filter(|(i, _)| *i != seed)
-        .map(|(i, p)| ((p - here).norm(), i))
+        .map(|(i, p)| ((p.at - here).norm(), i))
         .collect();
     near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     near.truncate(AROUND);
-    let along: Vec<usize> = near
+    let along: Vec<(usize, bool)> = near
         .iter()
-        .map(|(_, i)| *i)
-        .filter(|i| edge(smooth, &here, &points[*i]).is_some())
+        .filter(|(_, i)| alike(&points[seed], &points[*i]))
+        .filter_map(|(_, i)| Some((*i, edge(smooth, &here, &points[*i].at)?)))
         .collect();
     let mut pairs = Vec::new();
-    for &a in &along {
-        for &b in &along {
-            let (p, q) = (points[a] - here, points[b] - here);
+    for &(a, first) in &along {
+        for &(b, second) in &along {
+            let (p, q) = (points[a].at - here, points[b].at - here);
             let turn = p.perp(&q) / (p.norm() * q.norm());
             // Clockwise in the picture, and of opposite contrast: a crossing's two edges.
-            let signs = [
-                edge(smooth, &here, &points[a]),
-                edge(smooth, &here, &points[b]),
-            ];
-            if turn > 0.3 && signs[0].zip(signs[1]).is_some_and(|(x, y)| x != y) {
-                pairs.push((a, b));
+            if turn > 0.3 && first != second {
+                pairs.push((a, b, first));
             }
         }
     }
     pairs.truncate(4);
     pairs
+}
+
+/// Whether two neighbours have contrasts that one board can have.
+fn alike(a: &Crossing, b: &Crossing) -> bool {
+    a.swing.min(b.swing) >= ALIKE * a.swing.max(b.swing)
 }
 
 /// Whether the line between two crossings is an edge: the sign of bright minus dark from its
@@ -129,7 +147,7 @@ fn edge(smooth: &ImageF, from: &Vector2<f64>, to: &Vector2<f64>) -> Option<bool>
 
 impl Growing<'_> {
     fn at(&self, cell: Cell) -> Option<Vector2<f64>> {
-        self.cells.get(&cell).map(|i| self.points[*i])
+        self.cells.get(&cell).map(|i| self.points[*i].at)
     }
 
     /// Where a free cell's corner must be, and how long a step is there.
@@ -185,8 +203,7 @@ impl Growing<'_> {
                 let Some(found) = self.nearest(&place, REACH * step) else {
                     continue;
                 };
-                let back = self.at(behind);
-                if back.is_some_and(|b| edge(self.smooth, &b, &self.points[found]).is_some()) {
+                if self.belongs(behind, cell, found) {
                     self.cells.insert(cell, found);
                     self.taken[found] = true;
                     grown = true;
@@ -198,12 +215,22 @@ impl Growing<'_> {
         }
     }
 
+    /// Whether a candidate beside a corner of the grid is the board's next corner: as strong, and
+    /// behind an edge whose sides are dark and bright as the board's squares alternate.
+    fn belongs(&self, behind: Cell, cell: Cell, candidate: usize) -> bool {
+        let (last, next) = (&self.points[self.cells[&behind]], &self.points[candidate]);
+        let even = (behind.0 + behind.1) % 2 == 0;
+        let along_x = cell.1 == behind.1;
+        let bright_left = self.bright_left == (even == along_x);
+        alike(last, next) && edge(self.smooth, &last.at, &next.at) == Some(bright_left)
+    }
+
     fn nearest(&self, place: &Vector2<f64>, within: f64) -> Option<usize> {
         self.points
             .iter()
             .enumerate()
             .filter(|(i, _)| !self.taken[*i])
-            .map(|(i, p)| ((p - place).norm(), i))
+            .map(|(i, p)| ((p.at - place).norm(), i))
             .filter(|(distance, _)| *distance <= within)
             .min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)))
             .map(|(_, i)| i)

@@ -1,12 +1,12 @@
 //! A printed chessboard in a photograph: its inner corners to subpixel, in order, without a hint.
 //!
-//! 1. [`candidates`]: points where the smoothed image is a saddle and a ring around them changes
-//!    between dark and bright four times.
+//! 1. [`candidates`]: points where the smoothed image is a saddle between dark and bright, and two
+//!    edges go straight through a ring around them.
 //! 2. [`refine`]: each one to subpixel, as the point to which all gradients around it are
 //!    perpendicular (Foerstner and Guelch 1987), in a window that fits its neighbours.
-//! 3. [`grid`]: grown from pairs of neighbours whose connecting edge has dark on one side and bright
-//!    on the other, until the board is complete; corners that the first step missed are looked for
-//!    where the grid says they must be.
+//! 3. [`grid`]: grown from pairs of neighbours of like contrast whose connecting edge has dark on
+//!    one side and bright on the other, alternating from square to square, until the board is
+//!    complete.
 //!
 //! The search starts on the full picture and goes on with halved ones, where blur and noise are
 //! smaller; the corners are always refined on the full picture.
