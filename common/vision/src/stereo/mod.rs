@@ -8,12 +8,9 @@
 
 mod coarse;
 mod dense;
-mod dense_export;
-mod dense_regions;
 mod link;
 mod matching;
 mod patch_plane;
-mod plane_smoothing;
 mod rectify;
 mod refine;
 mod rules;
@@ -22,8 +19,7 @@ mod surface;
 mod surface_fit;
 mod window;
 
-pub use dense::{DenseError, DenseRules, Disparity, dense_disparity};
-pub use dense_export::PairDisparityError;
+pub use dense::{DenseError, DenseRules, Disparity, PairDisparityError, dense_disparity};
 pub use matching::{MatchFailure, StereoMatch, match_point};
 pub use patch_plane::{
     PlaneFailure, PlaneRules, StereoPlane, SurfacePlane, measure_distant_surface, measure_plane,
@@ -144,7 +140,5 @@ impl TryFrom<&Image8> for PreparedImage {
     }
 }
 
-#[cfg(test)]
-mod dense_tests;
 #[cfg(test)]
 mod tests;

@@ -5,6 +5,7 @@ use nalgebra::{Isometry3, Vector2, Vector3};
 use rover_cameras::Side;
 
 use super::*;
+use crate::stereo::*;
 use crate::synthetic::{self, Rays};
 
 /// Both images of a textured plane, through the distorted test cameras.
@@ -121,4 +122,124 @@ fn nothing_is_claimed_without_texture_or_for_unrelated_images() {
         text.contains("half_window_px") && text.contains('9'),
         "{text}"
     );
+}
+
+/// The same rules pixel by pixel, every window summed anew.
+fn brute_force(left: &Image8, right: &Image8, rules: &DenseRules, u: i64, v: i64) -> Option<f64> {
+    let slope = |image: &Image8, u: i64, v: i64| {
+        let (w, h) = (i64::from(image.width_px), i64::from(image.height_px));
+        if u < 1 || v < 1 || u >= w - 1 || v >= h - 1 {
+            return 0;
+        }
+        let grey =
+            |du: i64, dv: i64| i32::from(image.get((u + du) as u32, (v + dv) as u32).unwrap());
+        let step = |dv| grey(1, dv) - grey(-1, dv);
+        ((step(-1) + 2 * step(0) + step(1)) >> 1).clamp(-31, 31)
+    };
+    let half = i64::from(rules.half_window_px);
+    let around = |u: i64, v: i64| {
+        (v - half..=v + half).flat_map(move |y| (u - half..=u + half).map(move |x| (x, y)))
+    };
+    let sum = |u: i64, d: i64| -> i32 {
+        around(u, v)
+            .map(|(x, y)| (slope(left, x, y) - slope(right, x - d, y)).abs())
+            .sum()
+    };
+    let texture: i32 = around(u, v).map(|(x, y)| slope(left, x, y).abs()).sum();
+    let side = 2 * half + 1;
+    if i64::from(texture) < i64::from(rules.min_texture_dn) * side * side {
+        return None;
+    }
+    let most = i64::from(rules.disparities);
+    let best = (0..most).min_by_key(|&d| (sum(u, d), d)).unwrap();
+    let least = sum(u, best);
+    let second = (0..most)
+        .filter(|d| (d - best).abs() > 1)
+        .map(|d| sum(u, d))
+        .min()
+        .unwrap();
+    let unique = second * 100 >= least * (100 + rules.uniqueness_percent as i32);
+    let back = (0..most)
+        .filter(|d| u - best + d < i64::from(left.width_px) - half)
+        .min_by_key(|&d| (sum(u - best + d, d), d))
+        .unwrap();
+    let (before, after) = (sum(u, best - 1), sum(u, best + 1));
+    let steep = before.max(after) - least;
+    let fine = best > 0 && best + 1 < most && steep > 0;
+    (unique && fine && (back - best).abs() <= i64::from(rules.left_right_px))
+        .then(|| (best * 64 + i64::from((before - after) * 64 / (2 * steep))) as f64 / 64.0)
+}
+
+#[test]
+fn sums_that_are_carried_along_find_what_a_plain_search_finds() {
+    let pixel = Vector2::new(340.0, 240.0);
+    let pair = synthetic::pair();
+    let pose = synthetic::facing_pose(&pair.left, pixel, 0.75, 0.6, 0.3, 0.0);
+    let images = plane_images(&pose, 4.0, 7);
+    let rectifier = Rectifier::new(&pair, 50.0).unwrap();
+    let cut = |image: &Image8| {
+        let rows = (150..190).flat_map(|v| (300..460).map(move |u| (u, v)));
+        let pixels = rows.map(|(u, v)| image.get(u, v).unwrap()).collect();
+        Image8::from_raw(160, 40, pixels).unwrap()
+    };
+    let left = cut(&rectifier.apply(&images[0], Side::Left).unwrap());
+    let right = cut(&rectifier.apply(&images[1], Side::Right).unwrap());
+    let (mut with, mut without) = (0, 0);
+    for (disparities, half_window_px) in [(16, 3), (21, 4), (64, 5)] {
+        let rules = DenseRules {
+            disparities,
+            half_window_px,
+            half_plane_px: 0,
+            min_region_px: 0,
+            ..DenseRules::default()
+        };
+        let found = dense_disparity(&left, &right, &rules).unwrap();
+        for v in (half_window_px..40 - half_window_px).step_by(3) {
+            for u in (disparities + half_window_px..160 - half_window_px).step_by(3) {
+                let plain = brute_force(&left, &right, &rules, i64::from(u), i64::from(v));
+                assert_eq!(found.at(u, v), plain, "{disparities} at {u}, {v}");
+                *(if plain.is_some() {
+                    &mut with
+                } else {
+                    &mut without
+                }) += 1;
+            }
+        }
+    }
+    assert!(with > 500 && without > 300, "{with} {without}");
+}
+
+#[test]
+fn small_regions_go_and_large_ones_stay_whatever_their_shape() {
+    // a comb: its teeth meet only in the last row; and beside it a lone tooth
+    let (w, h) = (12, 6);
+    let mut held = vec![NONE; w * h];
+    for v in 0..h {
+        for u in (0..9).step_by(2) {
+            held[v * w + u] = 640;
+        }
+        held[v * w + 11] = 640;
+    }
+    for u in 0..9 {
+        held[(h - 1) * w + u] = 640;
+    }
+    // a step of more than a pixel parts a region
+    held[(h - 2) * w] = 640 + 65;
+    held[(h - 2) * w + 2] = 640 + 64;
+    let kept = |least: usize| {
+        let mut disparity = Disparity {
+            width_px: w as u32,
+            height_px: h as u32,
+            held: held.clone(),
+        };
+        regions::drop_small(&mut disparity, least);
+        let alone = disparity.at(11, 0).is_some();
+        [disparity.count(), usize::from(alone)]
+    };
+    // 5 teeth of 6 and 4 between; less the parted pixel and the 4 above it
+    assert_eq!(kept(2), [34 - 1 + 6, 1]);
+    assert_eq!(kept(6), [34 - 5 + 6, 1]);
+    assert_eq!(kept(7), [34 - 5, 0]);
+    assert_eq!(kept(29), [29, 0]);
+    assert_eq!(kept(30), [0, 0]);
 }

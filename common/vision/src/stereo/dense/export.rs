@@ -4,9 +4,9 @@ use image::codecs::png::PngEncoder;
 use image::{ExtendedColorType, ImageEncoder};
 use rover_cameras::Side;
 
-use super::dense::{Disparity, NONE, STEPS};
-use super::{DenseError, DenseRules, Rectifier, RectifyError, dense_disparity};
+use super::{DenseError, DenseRules, Disparity, NONE, STEPS, dense_disparity};
 use crate::image::{Image8, ImageError};
+use crate::stereo::{Rectifier, RectifyError};
 
 /// Why a pair has no disparity image.
 #[derive(Debug, thiserror::Error)]
