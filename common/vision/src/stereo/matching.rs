@@ -307,7 +307,9 @@ const AGREEMENT_PX: f64 = 0.02;
 /// Residual of the wider window over the smaller one's, whose own is known to a twentieth.
 const MAX_RESIDUAL_RATIO: f64 = 1.15;
 
-/// The same fit over a window large enough for the aimed certainty, if the surface allows it.
+/// The same fit over a window large enough for the aimed certainty, if the surface allows it. Where
+/// the larger window fits as well but disagrees, the smaller one holds on to noise: it is as
+/// uncertain as they differ.
 pub(super) fn widened(
     link: &Link,
     narrow: &Refined,
@@ -330,8 +332,16 @@ pub(super) fn widened(
     // the smaller window is part of the wider one: of the difference, the variances differ
     let variance = (narrow.sigma_px.powi(2) - wide.sigma_px.powi(2)).max(0.0);
     let agrees = off.abs() <= AGREEMENT_SIGMAS * variance.sqrt() + AGREEMENT_PX;
-    let fits = wide.residual_dn <= MAX_RESIDUAL_RATIO * narrow.residual_dn;
-    (agrees && fits && wide.sigma_px < narrow.sigma_px).then_some(wide)
+    if wide.residual_dn > MAX_RESIDUAL_RATIO * narrow.residual_dn {
+        return None;
+    }
+    if agrees {
+        return (wide.sigma_px < narrow.sigma_px).then_some(wide);
+    }
+    Some(Refined {
+        sigma_px: narrow.sigma_px.hypot(off),
+        ..*narrow
+    })
 }
 
 /// Noise is never held responsible for more than this part of a window's variance.

@@ -59,6 +59,11 @@ const NOISY: f64 = 1.1;
 /// Least gain between the windows.
 const MIN_GAIN: f64 = 0.2;
 
+/// Part of white noise's variance that resampling leaves, on the average over places between the
+/// pixels: the square of the integral of the squared cubic cardinal spline (one per axis). What it
+/// takes away is not in the residual, but the fit, which is smooth, feels the noise in full.
+const RESAMPLED_NOISE: f64 = 0.764;
+
 type Normal = SMatrix<f64, 6, 6>;
 
 /// Derivatives by the four geometric parameters, one padded plane each, and the normal matrix.
@@ -233,7 +238,8 @@ fn refine_plain(
         let n = count as f64;
         let square = dot(&padded, &padded);
         let residual = (square - x.dot(&right_side)).max(0.0) / (n - 6.0);
-        let noise_square = residual / (1.0 + gain * gain);
+        let noise_square = residual / (RESAMPLED_NOISE + gain * gain);
+        let felt = noise_square * (1.0 + gain * gain);
         let along = &derived.along;
         let inflation = window.inflation(&d[0], gradients, along, noise_square);
         // the noise of the left values takes as much from the gain
@@ -286,7 +292,7 @@ fn refine_plain(
             let variance = square - sum * sum / n;
             let score = cross / (window.square * variance).sqrt();
             let inverse = derived.factor.inverse();
-            let sigma = (residual.max(0.1) * inverse[(0, 0)]).sqrt() * inflation / gain;
+            let sigma = (felt.max(0.1) * inverse[(0, 0)]).sqrt() * inflation / gain;
             return Ok(Refined {
                 displacement: now,
                 score,
