@@ -51,9 +51,10 @@ pub const DEFAULT_SCENARIO: &str = "scenarios/single_cycle.toml";
 pub fn find(files: &'static [ShippedFile], name: &str) -> Option<ShippedFile> {
     let name = name.strip_prefix("./").unwrap_or(name);
     let within = |shipped: &str| {
-        shipped
-            .strip_suffix(name)
-            .is_some_and(|folder| folder.is_empty() || folder.ends_with('/'))
+        [shipped, shipped.strip_suffix(".toml").unwrap_or(shipped)]
+            .iter()
+            .filter_map(|s| s.strip_suffix(name))
+            .any(|folder| folder.is_empty() || folder.ends_with('/'))
     };
     let found = |(shipped, _): &&ShippedFile| !name.is_empty() && within(shipped);
     files.iter().find(found).copied()

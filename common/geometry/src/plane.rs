@@ -11,6 +11,9 @@ pub struct Plane {
     pub normal: Unit<Vector3<f64>>,
     /// Root mean square distance of the points from the plane, unit of the points.
     pub rms: f64,
+    /// Root mean square distance of the points from their centroid in that direction in the plane
+    /// in which they spread least, unit of the points.
+    pub least_spread: f64,
 }
 
 /// Why a plane could not be fitted.
@@ -64,6 +67,7 @@ impl Plane {
             centroid,
             normal,
             rms: small.sqrt(),
+            least_spread: middle.sqrt(),
         })
     }
 

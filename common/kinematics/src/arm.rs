@@ -41,6 +41,55 @@ pub struct Arm {
     /// One per joint, or none at all.
     tilts_rad: Vec<f64>,
     pub(crate) family: Result<Family, FamilyMismatch>,
+    /// Bound of the distance of the last link's origin from the base, m.
+    chain_m: f64,
+}
+
+/// Sweeps over the points of a chain, and steps of the search along each axis.
+const CHAIN_SWEEPS: usize = 40;
+const CHAIN_STEPS: usize = 60;
+
+/// A short chain of points on the axes from the base to the last link's origin, m. Any choice of
+/// points bounds the reach; the best is approached one point at a time (the sum is convex).
+fn chain_m(rows: &[DhRow], tilts_rad: &[f64]) -> f64 {
+    let n = rows.len();
+    // from a point on the axis of row i to one on the next axis, both by their places along it
+    let link = |i: usize, here: f64, next: f64| {
+        let (row, tilt) = (&rows[i], tilts_rad.get(i).copied().unwrap_or(0.0));
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), row.alpha_rad)
+            * UnitQuaternion::from_axis_angle(&Vector3::y_axis(), tilt);
+        let start = Vector3::new(row.a_m, 0.0, row.d_m - here);
+        // the last link's origin is a point, not an axis
+        (start + turn * Vector3::z() * if i + 1 < n { next } else { 0.0 }).norm()
+    };
+    let mut places = vec![0.0; n];
+    let around = |places: &[f64], i: usize, here: f64| {
+        let before = match i {
+            0 => here.abs(),
+            _ => link(i - 1, places[i - 1], here),
+        };
+        before + link(i, here, places.get(i + 1).copied().unwrap_or(0.0))
+    };
+    let longest = rows.iter().map(|r| r.a_m.hypot(r.d_m)).sum::<f64>();
+    for _ in 0..CHAIN_SWEEPS {
+        for i in 0..n {
+            let (mut low, mut high) = (-longest, longest);
+            for _ in 0..CHAIN_STEPS {
+                let (a, b) = (low + (high - low) / 3.0, high - (high - low) / 3.0);
+                if around(&places, i, a) <= around(&places, i, b) {
+                    high = b;
+                } else {
+                    low = a;
+                }
+            }
+            let better = 0.5 * (low + high);
+            if around(&places, i, better) < around(&places, i, places[i]) {
+                places[i] = better;
+            }
+        }
+    }
+    let links = (0..n).map(|i| link(i, places[i], places.get(i + 1).copied().unwrap_or(0.0)));
+    places[0].abs() + links.sum::<f64>()
 }
 
 /// Axes and origins of all frames, `0..=n`, in the base frame.
@@ -169,6 +218,7 @@ impl Arm {
             HalfTwist { sine, cosine }
         });
         let family = Family::of(&rows, &tilts_rad);
+        let chain_m = chain_m(&rows, &tilts_rad);
         Ok(Self {
             rows,
             limits,
@@ -176,6 +226,7 @@ impl Arm {
             half_twists,
             tilts_rad,
             family,
+            chain_m,
         })
     }
 
@@ -194,10 +245,14 @@ impl Arm {
         &self.tilts_rad
     }
 
-    /// The longest distance that the tool point can have from the base, metres, for a tip at this
-    /// distance from the last link's origin: all lengths added up, so that nothing lies beyond.
+    /// A distance that the tool point, this far from the last link's origin, never has from the
+    /// base, metres.
+    ///
+    /// A point on a joint's axis is at a fixed distance from one on the next joint's, whatever the
+    /// angles: the sum of such distances from the base outwards bounds the reach. The points are
+    /// placed so that the sum is small, since axes that are nearly parallel meet far away.
     pub fn reach_m(&self, tip_m: f64) -> f64 {
-        self.rows.iter().map(|r| r.a_m.hypot(r.d_m)).sum::<f64>() + tip_m
+        self.chain_m + tip_m
     }
 
     /// The joint limits, from the base outwards.

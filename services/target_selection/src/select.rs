@@ -159,6 +159,12 @@ fn refused(failure: &SurfaceFailure, request: &SelectRequest) -> Fault {
             .with("plane_rms_limit_mm", *rms_limit_mm)
             .with("roughness_mm", *roughness_mm)
             .with("roughness_limit_mm", *roughness_limit_mm),
+        F::NormalUncertain {
+            sigma_deg,
+            limit_deg,
+        } => named("normal_uncertain")
+            .with("sigma_deg", *sigma_deg)
+            .with("limit_deg", *limit_deg),
         F::NormalFacingAway { cosine, limit } => named("normal_facing_away")
             .with("cosine", *cosine)
             .with("limit", *limit),

@@ -9,6 +9,10 @@ use std::f64::consts::TAU;
 /// How far a joint without limits may turn to either side, rad.
 const ENDLESS_RAD: f64 = TAU;
 
+/// Rate of a joint without a limit, rad/s. Where joint travel is weighed by rates, such joints
+/// weigh least, and alike among themselves.
+pub const NO_RATE_LIMIT_RAD_S: f64 = 1e100;
+
 /// Which chain, and what the file may lack.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ChainOptions {
@@ -16,7 +20,7 @@ pub struct ChainOptions {
     pub base: Option<String>,
     /// Link that carries the tool; the only end of an arm of 4 to 7 joints if not given.
     pub tip: Option<String>,
-    /// Rate limit of joints that have none in the file, rad/s.
+    /// Rate limit of joints that have none in the file, rad/s; [`NO_RATE_LIMIT_RAD_S`] if not given.
     pub max_rate_rad_s: Option<f64>,
     /// Acceleration limit of all joints, rad/s^2: the format has none.
     pub max_acceleration_rad_s2: Option<f64>,
@@ -282,16 +286,12 @@ impl Urdf {
         };
         let rate = match given.velocity_rad_s.filter(|v| *v > 0.0) {
             Some(rate) => rate,
+            // Not needed before a motion is timed, as with the acceleration.
             None => {
-                let rate = options.max_rate_rad_s.ok_or_else(|| {
-                    let found = given.velocity_rad_s.map_or("none".into(), |v| v.to_string());
-                    let message = format!("has the rate limit {found}, expected a positive one in the file or as an option");
-                    self.joint_error(joint, message)
-                })?;
-                note(format!(
-                    "has no rate limit in the file: {rate} rad/s as given"
-                ));
-                rate
+                let rate = options.max_rate_rad_s;
+                let said = rate.map_or("none is used".into(), |r| format!("{r} rad/s as given"));
+                note(format!("has no rate limit in the file: {said}"));
+                rate.unwrap_or(NO_RATE_LIMIT_RAD_S)
             }
         };
         Ok(JointLimits {

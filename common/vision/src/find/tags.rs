@@ -55,7 +55,8 @@ impl Default for TagRules {
 }
 
 /// All tags of a family in a window, by identity. With `size` (camera; side of the border's outer
-/// square, m) each has a pose: origin in the middle, x right, y up, z out of the tag.
+/// square, m) each has a pose: origin in the middle, x right, y up, z out of the tag as the family's
+/// own pictures stand; its place is then the image of that origin, else where the diagonals cross.
 ///
 /// # Errors
 /// [`NoFinding`]: what refused the largest square seen, `NothingThere` without one, `BadInput`.
@@ -236,7 +237,13 @@ fn measure(
     let mut finding = Finding::at(middle.x, middle.y, score, 0.5 * sigma_px);
     finding.id = Some(read.id);
     if let Some((camera, side_m)) = size {
-        finding.pose = Some(pose(camera, side_m, &corners, sigma_px, rules)?);
+        let pose = pose(camera, side_m, &corners, sigma_px, rules)?;
+        // straight diagonals are not straight through a lens: the middle's own image is
+        let origin = pose.camera_frame_from_fiducial.translation.vector;
+        if let Ok(middle) = camera.project(&origin) {
+            (finding.u_px, finding.v_px) = (middle.x, middle.y);
+        }
+        finding.pose = Some(pose);
     }
     Ok(finding)
 }

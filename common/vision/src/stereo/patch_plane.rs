@@ -174,6 +174,7 @@ pub fn measure_distant_surface(
     Ok(Surface {
         position: seen.plane.point,
         normal,
+        normal_sigma_rad: None,
         plane_rms_m: (square / heights_m.len() as f64).sqrt(),
         roughness_m: high - low,
         points_used: heights_m.len(),

@@ -173,6 +173,8 @@ pub struct SurfaceRules {
     pub max_plane_rms_m: f64,
     /// Largest accepted extent of the surface along its normal, m.
     pub max_roughness_m: f64,
+    /// Largest accepted standard deviation of the normal, in its worst direction, deg.
+    pub max_normal_sigma_deg: f64,
     /// Least cosine between normal and direction to the left camera.
     pub min_facing_cosine: f64,
     /// Largest jump of the displacement against the prediction from a neighbour, px.
@@ -197,6 +199,7 @@ impl Default for SurfaceRules {
             reject_factor: 2.0,
             max_plane_rms_m: 0.004,
             max_roughness_m: 0.015,
+            max_normal_sigma_deg: 5.0,
             min_facing_cosine: 0.2,
             max_jump_px: 1.0,
             common_sigma_px: 0.01,
@@ -235,6 +238,7 @@ impl SurfaceRules {
             ("reject_factor", self.reject_factor),
             ("max_plane_rms_m", self.max_plane_rms_m),
             ("max_roughness_m", self.max_roughness_m),
+            ("max_normal_sigma_deg", self.max_normal_sigma_deg),
             ("max_jump_px", self.max_jump_px),
             ("common_sigma_px", self.common_sigma_px),
             ("pixel_sigma_px", self.pixel_sigma_px),

@@ -18,6 +18,9 @@ pub struct Surface {
     pub position: Vector3<f64>,
     /// Unit normal, towards the left camera.
     pub normal: Unit<Vector3<f64>>,
+    /// Standard deviation of the normal in the direction in which it is known least, rad; `None`
+    /// where it was not measured (distant surfaces).
+    pub normal_sigma_rad: Option<f64>,
     /// Root mean square distance of the points used from their plane, m.
     pub plane_rms_m: f64,
     /// Extent of the surrounding surface along the normal, m.
@@ -93,6 +96,14 @@ pub enum SurfaceFailure {
         roughness_mm: f64,
         /// Its limit, mm.
         roughness_limit_mm: f64,
+    },
+    /// The points lie too close to a line, or scatter too much, for a normal.
+    #[error("the normal is uncertain by {sigma_deg:.1} deg, limit {limit_deg} deg")]
+    NormalUncertain {
+        /// Standard deviation in the worst direction, deg.
+        sigma_deg: f64,
+        /// Its limit, deg.
+        limit_deg: f64,
     },
     /// The surface is seen at too flat an angle.
     #[error("the cosine between normal and direction to the camera is {cosine:.3}, limit {limit}")]
@@ -196,14 +207,25 @@ pub fn measure_surface(
 
     let back = -ray.direction.into_inner();
     let samples = grid.samples_near(&position, rules.separation_m);
-    let points: Vec<Vector3<f64>> = samples.iter().map(|s| s.point).collect();
-    let patch = fit_patch(&points, &back, rules)?;
+    // windows overlap: the samples hold only this many independent looks
+    let spacing = (rules.grid_step_px / side).powi(2).min(1.0);
+    let patch = fit_patch(&samples, spacing, &back, rules)?;
     if patch.rms_m > rules.max_plane_rms_m || patch.roughness_m > rules.max_roughness_m {
         return Err(SurfaceFailure::TooRough {
             rms_mm: patch.rms_m * 1e3,
             rms_limit_mm: rules.max_plane_rms_m * 1e3,
             roughness_mm: patch.roughness_m * 1e3,
             roughness_limit_mm: rules.max_roughness_m * 1e3,
+        });
+    }
+    let (sigma_deg, limit_deg) = (
+        patch.normal_sigma_rad.to_degrees(),
+        rules.max_normal_sigma_deg,
+    );
+    if !(sigma_deg <= limit_deg) {
+        return Err(SurfaceFailure::NormalUncertain {
+            sigma_deg,
+            limit_deg,
         });
     }
     let cosine = patch.normal.dot(&back);
@@ -214,8 +236,6 @@ pub fn measure_surface(
         });
     }
 
-    // windows overlap: the samples hold only this many independent looks
-    let spacing = (rules.grid_step_px / side).powi(2).min(1.0);
     let px = grid.px_per_inverse_range;
     let scatter = (centre.scatter * px).max(rules.matching.sigma_floor_px);
     let independent = (samples.len() as f64 * spacing).max(1.0);
@@ -228,6 +248,7 @@ pub fn measure_surface(
     Ok(Surface {
         position,
         normal: patch.normal,
+        normal_sigma_rad: Some(patch.normal_sigma_rad),
         plane_rms_m: patch.rms_m,
         roughness_m: patch.roughness_m,
         points_used: patch.used,

@@ -102,6 +102,8 @@ pub(super) fn fit_centre(
 /// A plane, and which points it was fitted to.
 pub(super) struct Patch {
     pub normal: Unit<Vector3<f64>>,
+    /// Standard deviation of the normal in the direction in which it is known least, rad.
+    pub normal_sigma_rad: f64,
     pub rms_m: f64,
     /// Extent of the points along the normal, m.
     pub roughness_m: f64,
@@ -109,9 +111,11 @@ pub(super) struct Patch {
 }
 
 /// The flight rule (C. Leger): fit, and while the mean distance exceeds the limit drop the points
-/// farther than a multiple of it. Roughness is taken over all points.
+/// farther than a multiple of it. Roughness is taken over all points. `independent_part` of the
+/// points are independent looks: matching windows overlap.
 pub(super) fn fit_patch(
-    points: &[Vector3<f64>],
+    samples: &[Sample],
+    independent_part: f64,
     towards: &Vector3<f64>,
     rules: &SurfaceRules,
 ) -> Result<Patch, SurfaceFailure> {
@@ -119,20 +123,22 @@ pub(super) fn fit_patch(
         found,
         needed: rules.min_points,
     };
-    let mut kept: Vec<Vector3<f64>> = points.to_vec();
+    let mut kept: Vec<&Sample> = samples.iter().collect();
     loop {
         if kept.len() < rules.min_points {
             return Err(too_few(kept.len()));
         }
-        let plane = Plane::fit(&kept, towards).map_err(|_| too_few(0))?;
-        let distance = |p: &Vector3<f64>| plane.normal.dot(&(p - plane.centroid));
-        let mean = kept.iter().map(|p| distance(p).abs()).sum::<f64>() / kept.len() as f64;
+        let points: Vec<Vector3<f64>> = kept.iter().map(|s| s.point).collect();
+        let plane = Plane::fit(&points, towards).map_err(|_| too_few(0))?;
+        let distance = |s: &Sample| plane.signed_distance(&s.point);
+        let n = kept.len() as f64;
+        let mean = kept.iter().map(|s| distance(s).abs()).sum::<f64>() / n;
         let before = kept.len();
         if mean > rules.plane_error_m {
             let limit = rules.reject_factor * mean;
-            let next: Vec<Vector3<f64>> = kept
+            let next: Vec<&Sample> = kept
                 .iter()
-                .filter(|p| distance(p).abs() <= limit)
+                .filter(|s| distance(s).abs() <= limit)
                 .copied()
                 .collect();
             if next.len() < before && next.len() >= rules.min_points {
@@ -140,13 +146,20 @@ pub(super) fn fit_patch(
                 continue;
             }
         }
-        let mut heights: Vec<f64> = points.iter().map(distance).collect();
+        // what the matches' own deviations make along the normal, or what is seen if that is more
+        let cosine = plane.normal.dot(towards);
+        let height = |s: &&Sample| s.sigma * cosine / (s.inverse_range * s.inverse_range);
+        let expected = (kept.iter().map(|s| height(s).powi(2)).sum::<f64>() / n).sqrt();
+        let looks = (n * independent_part).max(1.0);
+        let normal_sigma_rad = expected.max(plane.rms) / (looks.sqrt() * plane.least_spread);
+        let mut heights: Vec<f64> = samples.iter().map(distance).collect();
         heights.sort_by(f64::total_cmp);
         // the outermost two per cent are left to mismatches
         let trim = heights.len() / 50;
         let roughness_m = heights[heights.len() - 1 - trim] - heights[trim];
         return Ok(Patch {
             normal: plane.normal,
+            normal_sigma_rad,
             rms_m: plane.rms,
             roughness_m,
             used: kept.len(),

@@ -131,6 +131,7 @@ fn the_fused_surface_point_is_better_than_three_hundredths_of_a_pixel() {
     let mut rng = synthetic::rng(12);
     let rules = SurfaceRules::default();
     let (mut errors, mut normalised, mut tilt) = (Vec::new(), Vec::new(), Vec::new());
+    let mut turned = Vec::new();
     let mut refused = 0;
     for case in 0..50 {
         let (pixel, range, pose) = random_plane(&mut rng);
@@ -151,6 +152,9 @@ fn the_fused_surface_point_is_better_than_three_hundredths_of_a_pixel() {
                         .acos()
                         .to_degrees(),
                 );
+                // two directions, each at most as uncertain as stated
+                let off = tilt[tilt.len() - 1].to_radians();
+                turned.push(off / found.normal_sigma_rad.unwrap());
                 assert!(found.plane_rms_m < 1e-3, "{}", found.plane_rms_m);
                 let d2 = (found.position - truth)
                     .dot(&(found.covariance.try_inverse().unwrap() * (found.position - truth)));
@@ -175,6 +179,9 @@ fn the_fused_surface_point_is_better_than_three_hundredths_of_a_pixel() {
     assert!(bias.hypot(sigma) < 0.03);
     assert!((0.4..1.8).contains(&ratio));
     assert!(tilt[tilt.len() / 2] < 1.0);
+    let mean_square = turned.iter().map(|x| x * x).sum::<f64>() / turned.len() as f64;
+    println!("normal: {:.2} of stated", mean_square.sqrt());
+    assert!((0.3..2.0).contains(&mean_square.sqrt()), "{mean_square}");
 }
 
 /// Nearest positive hit of a sphere: (parameter, point).

@@ -5,6 +5,7 @@ use crate::commands::{CommandError, Exit};
 use crate::output::{Output, print};
 use nalgebra::{Isometry3, Vector3};
 use rover_kinematics::{AxisGoal, IkError, solve_axis};
+use rover_robot::urdf::NO_RATE_LIMIT_RAD_S;
 use serde::Serialize;
 use std::fmt::Write;
 use std::path::PathBuf;
@@ -38,7 +39,8 @@ struct Joint {
     tilt_rad: f64,
     lower_rad: f64,
     upper_rad: f64,
-    max_rate_rad_s: f64,
+    /// A URDF need not have one.
+    max_rate_rad_s: Option<f64>,
     /// A URDF has none.
     max_acceleration_rad_s2: Option<f64>,
     /// Only a URDF has it.
@@ -162,7 +164,7 @@ fn collect(model: &ArmModel) -> Result<Info, CommandError> {
             tilt_rad: arm.tilts_rad().get(i).copied().unwrap_or(0.0),
             lower_rad: l.lower_rad,
             upper_rad: l.upper_rad,
-            max_rate_rad_s: l.max_rate_rad_s,
+            max_rate_rad_s: Some(l.max_rate_rad_s).filter(|r| *r < NO_RATE_LIMIT_RAD_S),
             max_acceleration_rad_s2: Some(l.max_acceleration_rad_s2).filter(|a| *a < f64::MAX),
             effort_nm,
         }
@@ -221,7 +223,7 @@ fn text(info: &Info) -> String {
     ));
     for j in &info.joints {
         line(format!(
-            "{:width$} {:>10.6} {:>10.6} {:>10.6} {:>10.6} {:>10.3e} {:>8.4} {:>8.4} {:>8.4}",
+            "{:width$} {:>10.6} {:>10.6} {:>10.6} {:>10.6} {:>10.3e} {:>8.4} {:>8.4} {:>8}",
             j.name,
             j.theta_offset_rad,
             j.d_m,
@@ -231,6 +233,7 @@ fn text(info: &Info) -> String {
             j.lower_rad,
             j.upper_rad,
             j.max_rate_rad_s
+                .map_or("none".into(), |r| format!("{r:.4}"))
         ));
     }
     if !info.postures.is_empty() {

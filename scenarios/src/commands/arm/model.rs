@@ -29,7 +29,8 @@ pub struct ModelArgs {
     /// URDF: folder that holds packages, or a package, for `package://` (repeatable)
     #[arg(long, value_name = "DIR")]
     pub package_path: Vec<PathBuf>,
-    /// URDF: rate limit of joints that have none in the file
+    /// URDF: rate limit of joints that have none in the file; only the nearest of several answers
+    /// depends on it
     #[arg(long, value_name = "RATE")]
     pub max_rate_rad_s: Option<f64>,
 }

@@ -18,7 +18,7 @@ use crate::output::Output;
 /// Both images are rectified first; columns and rows are those of the rectified left image, whose
 /// camera the JSON summary names. A PNG has 16 bits: value / 64 is the disparity in px, 0 marks a
 /// pixel without an answer. A CSV has a row for every pixel, u_px,v_px,disparity_px,x_m,y_m,z_m,
-/// status, in the frame of the camera models. Ranges are depths along the rectified cameras' axis;
+/// status, in the frame of the camera models. Ranges here are depths along the rectified cameras' axis;
 /// without --range-max-m the search begins at infinity, without --range-min-m it ends after as many
 /// disparities as the rules say. Exit code 3: no pixel has an answer.
 #[derive(Clone, Debug, clap::Args)]
@@ -59,6 +59,8 @@ struct Summary {
     found_percent: f64,
     /// Disparities searched, px: from, up to.
     searched_px: [f64; 2],
+    /// Depths searched, m: nearest, farthest; no farthest if up to infinity.
+    searched_depth_m: [Option<f64>; 2],
     /// Least, median and largest disparity found, px.
     #[serde(skip_serializing_if = "Option::is_none")]
     disparity_px: Option<[f64; 3]>,
@@ -171,11 +173,19 @@ pub fn run(args: &DisparityArgs) -> Result<Exit, CommandError> {
         Form::Csv => out.write(&field.table())?,
     }
     let summary = field.summary(&rules);
+    let depth = |d: Option<f64>| d.map_or("infinity".into(), |d| format!("{d:.3} m"));
+    let [near, far] = summary.searched_depth_m.map(depth);
     eprintln!(
-        "rover: {} of {} pixels have a disparity",
+        "rover: {} of {} pixels have a disparity; depths of {near} to {far} were searched",
         summary.found,
         found.width_px * found.height_px
     );
+    if args.pair.range_min_m.is_none() {
+        eprintln!(
+            "rover: what is nearer than {near} cannot be matched, and may be matched wrongly: \
+             --range-min-m extends the search"
+        );
+    }
     if let Some(json) = json {
         input::write_json(&json, &summary)?;
     }
@@ -246,6 +256,7 @@ impl Field<'_> {
             found: all.len(),
             found_percent: 100.0 * all.len() as f64 / pixels,
             searched_px: [from, to],
+            searched_depth_m: [to, from].map(|d| (d > 0.0).then(|| self.depth_px_m / d)),
             disparity_px: few(),
             depth_m: few()
                 .map(|[least, middle, most]| [most, middle, least].map(|d| self.depth_px_m / d)),

@@ -75,7 +75,8 @@ pub enum Kind {
     Saddle,
     /// The plate of discs and a saddle; gives its pose
     Plate,
-    /// A tag of --family; gives its pose with --model and --width-m
+    /// A tag of --family; gives its pose with --model and --width-m: origin in the middle, x right,
+    /// y up, z out of the tag, as the family's own pictures stand
     Apriltag,
 }
 
@@ -189,14 +190,18 @@ fn detect(args: &FindArgs, image: &Image8) -> Result<Found, CommandError> {
         }
         Kind::Apriltag => {
             let rules = input::rules(rules)?;
-            match args.width_m {
-                Some(width_m) => {
-                    let camera = camera("the tag's pose")?;
-                    let size = Some((&camera, width_m));
-                    find::tags(image, window, &args.family, size, &rules)
-                }
-                None => find::tags(image, window, &args.family, None, &rules),
+            if args.width_m.is_none() && args.model.is_none() {
+                return Ok(find::tags(image, window, &args.family, None, &rules));
             }
+            let width_m = *need(args.width_m.as_ref(), "--width-m", "the tag's pose")?;
+            let camera = camera("the tag's pose")?;
+            find::tags(
+                image,
+                window,
+                &args.family,
+                Some((&camera, width_m)),
+                &rules,
+            )
         }
     })
 }

@@ -27,10 +27,10 @@ pub struct PairArgs {
     /// Camera model of the right image
     #[arg(long, value_name = "FILE")]
     pub right_model: PathBuf,
-    /// Nearest range searched, along the left ray; replaces the rules' own
+    /// Nearest surface searched; without it the rules decide (match, normal: 0.35 m)
     #[arg(long, value_name = "M")]
     pub range_min_m: Option<f64>,
-    /// Farthest range searched; replaces the rules' own
+    /// Farthest surface searched; without it the rules decide (match, normal: 1.5 m)
     #[arg(long, value_name = "M")]
     pub range_max_m: Option<f64>,
     /// Thresholds as TOML; what it leaves out keeps its default
@@ -151,6 +151,8 @@ pub struct NormalArgs {
 struct SurfaceReport {
     position_m: [f64; 3],
     normal: [f64; 3],
+    /// In the direction in which the normal is known least.
+    normal_sigma_deg: Option<f64>,
     plane_rms_mm: f64,
     points_used: usize,
     roughness_mm: f64,
@@ -184,6 +186,7 @@ pub fn run_normal(args: &NormalArgs) -> Result<Exit, CommandError> {
             let report = SurfaceReport {
                 position_m: [p.x, p.y, p.z],
                 normal: [n.x, n.y, n.z],
+                normal_sigma_deg: s.normal_sigma_rad.map(f64::to_degrees),
                 plane_rms_mm: s.plane_rms_m * 1e3,
                 points_used: s.points_used,
                 roughness_mm: s.roughness_m * 1e3,
