@@ -47,6 +47,11 @@ pub struct DiscRules {
     /// Largest rms difference between model and image beyond the image's own noise, as a fraction of
     /// the contrast.
     pub max_residual_fraction: f64,
+    /// Largest deformation of the shape (bent edges, unequal blur or grey...), as a multiple of what
+    /// noise and a small granted deformation explain. Drawn discs hardly ever reach 1.2; of the dark
+    /// patches of thresholded texture that pass as small discs with 1.8, nine in ten exceed the
+    /// default.
+    pub max_deformation: f64,
     /// Largest grey noise of the image that the residual check puts up with, DN.
     pub noise_dn: f64,
     /// Largest blur of the edge, px.
@@ -74,6 +79,7 @@ impl Default for DiscRules {
             max_fill_error: 0.06,
             min_contrast_dn: 30.0,
             min_score: 0.965,
+            max_deformation: 1.3,
             max_residual_fraction: 0.02,
             noise_dn: 6.0,
             max_blur_px: 1.6,
@@ -99,6 +105,7 @@ impl DiscRules {
             ("min_contrast_dn", self.min_contrast_dn),
             ("min_score", self.min_score),
             ("max_residual_fraction", self.max_residual_fraction),
+            ("max_deformation", self.max_deformation),
             ("noise_dn", self.noise_dn),
             ("max_blur_px", self.max_blur_px),
             ("margin_px", self.margin_px),
@@ -195,10 +202,6 @@ impl PixelModel<6> for Ellipse {
     /// ellipse), blur changed by cos k t and sin k t for k = 1 and 2.
     const DEFORMATIONS: usize = 12;
     const GRANTED_PX: f64 = 0.02;
-    /// Discs hardly ever reach 1.2, since on all but the smallest the granted deformation outweighs
-    /// the noise; of the dark patches of thresholded texture that pass as small discs with 1.8,
-    /// nine in ten exceed 1.3.
-    const MAX_DEFORMATION: f64 = 1.3;
 
     fn deform(&self, p: &[f64; 6], u: f64, v: f64, out: &mut [f64]) {
         let [a, b, c] = self.matrix(p);

@@ -23,9 +23,6 @@ pub(super) trait PixelModel<const N: usize> {
     const DEFORMATIONS: usize;
     /// Deformation that is granted (print, lens, sensor, the model's own approximations), px.
     const GRANTED_PX: f64;
-    /// A shape passes with deformations up to this multiple of what noise and the granted
-    /// deformation explain, root mean square.
-    const MAX_DEFORMATION: f64;
 
     /// What deformations by one pixel each would add to the value at a pixel; `out` is zero.
     fn deform(&self, p: &[f64; N], u: f64, v: f64, out: &mut [f64]);
@@ -62,6 +59,7 @@ pub(super) struct FitRules {
     pub max_blur_px: f64,
     pub min_score: f64,
     pub max_residual_fraction: f64,
+    pub max_deformation: f64,
     pub noise_dn: f64,
     pub max_saturated_fraction: f64,
     pub max_sigma_px: f64,
@@ -76,6 +74,7 @@ macro_rules! fit_rules {
             max_blur_px: $max_blur_px,
             min_score: $rules.min_score,
             max_residual_fraction: $rules.max_residual_fraction,
+            max_deformation: $rules.max_deformation,
             noise_dn: $rules.noise_dn,
             max_saturated_fraction: $rules.max_saturated_fraction,
             max_sigma_px: $rules.max_sigma_px,
@@ -141,21 +140,21 @@ impl<const N: usize> PixelFit<N> {
                 limit: rules.max_saturated_fraction,
             });
         }
-        let floor = rules.sigma_floor_px;
-        let sigma_px = (self.sigma_px * self.sigma_px + floor * floor).sqrt();
+        let noise_dn = noise_dn.min(rules.noise_dn).max(QUANTISATION_DN);
+        let deformation = self.deformation(image, model, noise_dn)?;
+        // where the shape is more deformed than noise explains, its place is as much less certain
+        let sigma_px = (self.sigma_px * deformation.max(1.0)).hypot(rules.sigma_floor_px);
         if !(sigma_px <= rules.max_sigma_px) {
             return Err(NoFinding::Uncertain {
                 sigma_px,
                 limit_px: rules.max_sigma_px,
             });
         }
-        let noise_dn = noise_dn.min(rules.noise_dn).max(QUANTISATION_DN);
-        let deformation = self.deformation(image, model, noise_dn)?;
-        if !(deformation <= M::MAX_DEFORMATION) {
+        if !(deformation <= rules.max_deformation) {
             return Err(NoFinding::Shape {
                 what: "deformation over what noise explains",
                 found: deformation,
-                expected: format!("at most {}", M::MAX_DEFORMATION),
+                expected: format!("at most {}", rules.max_deformation),
             });
         }
         Ok(sigma_px)

@@ -32,6 +32,12 @@ pub struct SaddleRules {
     /// Largest rms difference between model and image beyond the image's own noise, as a fraction of
     /// the contrast.
     pub max_residual_fraction: f64,
+    /// Largest deformation of the shape (bent edges, unequal blur or grey...), as a multiple of what
+    /// noise and a small granted deformation explain. Of drawn crossings one in a hundred exceeds the
+    /// default; of the places where two dark patches of thresholded texture meet corner to corner
+    /// and which pass with 2.5, all but one in fifty. Photographs need more where light saturates,
+    /// a tone curve widens bright squares or compression rings.
+    pub max_deformation: f64,
     /// Largest grey noise of the image that the residual check puts up with, DN.
     pub noise_dn: f64,
     /// Least sine of the angle between the edges.
@@ -56,6 +62,7 @@ impl Default for SaddleRules {
             min_contrast_dn: 20.0,
             min_contrast_to_noise: 17.0,
             min_score: 0.93,
+            max_deformation: 1.15,
             max_residual_fraction: 0.025,
             noise_dn: 6.0,
             min_sine: 0.35,
@@ -77,6 +84,7 @@ impl SaddleRules {
             ("min_contrast_to_noise", self.min_contrast_to_noise),
             ("min_score", self.min_score),
             ("max_residual_fraction", self.max_residual_fraction),
+            ("max_deformation", self.max_deformation),
             ("noise_dn", self.noise_dn),
             ("min_sine", self.min_sine),
             ("max_blur_px", self.max_blur_px),
@@ -194,9 +202,6 @@ impl PixelModel<5> for Crossing {
     /// the crossing.
     const DEFORMATIONS: usize = 13;
     const GRANTED_PX: f64 = 0.07;
-    /// Of crossings one in a hundred exceeds this; of the places where two dark patches of
-    /// thresholded texture meet corner to corner and which pass with 2.5, all but one in fifty.
-    const MAX_DEFORMATION: f64 = 1.15;
 
     fn deform(&self, p: &[f64; 5], u: f64, v: f64, out: &mut [f64]) {
         let (du, dv) = (u - p[0], v - p[1]);
