@@ -3,6 +3,7 @@
 
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
+use super::lanes::{LANES, Lane, each, ramp, total};
 use super::model::{self, LocalMap, Part, Picture};
 use super::{NotFound, PlateSearch};
 use crate::image::Image8;
@@ -380,48 +381,22 @@ const NORMALISE_PX: f64 = 32.0;
 /// Least squares of image = gain * darkness(moved) + offset for the motion (du, dv, and the 2 x 2
 /// change per [`NORMALISE_PX`]); also the NCC of image and picture as they are.
 fn solve(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Option<([f64; 6], f64)> {
+    let sums = accumulate(picture, seen, map);
     let mut normal = SMatrix::<f64, 8, 8>::zeros();
     let mut right = SVector::<f64, 8>::zeros();
-    let (mut n, mut si, mut sii) = (0.0f64, 0.0f64, 0.0f64);
-    for j in 0..picture.height {
-        let mut rows = [0.0f32; 45];
-        let v = ((picture.origin_px.y + j as f64 * picture.step_px - map.pixel_px.y) / NORMALISE_PX)
-            as f32;
-        let line = seen.values(j);
-        for (i, &grey) in line.iter().enumerate().take(picture.width) {
-            let k = j * picture.width + i;
-            if !picture.mask[k] {
-                continue;
+    let mut sii = 0.0;
+    let mut at = 0;
+    for p in 0..9 {
+        for q in p..9 {
+            match (p < 8, q < 8) {
+                (true, true) => normal[(p, q)] = sums[at],
+                (true, false) => right[p] = sums[at],
+                _ => sii = sums[at],
             }
-            let u = ((picture.origin_px.x + i as f64 * picture.step_px - map.pixel_px.x)
-                / NORMALISE_PX) as f32;
-            let (gu, gv) = (-picture.du[k], -picture.dv[k]);
-            let t = picture.values[k];
-            let y = SearchImage::grey(grey);
-            let a = [gu, gv, gu * u, gu * v, gv * u, gv * v, t, 1.0, y];
-            let mut at = 0;
-            for (p, &ap) in a.iter().enumerate() {
-                for &aq in &a[p..] {
-                    rows[at] += ap * aq;
-                    at += 1;
-                }
-            }
-        }
-        let mut at = 0;
-        for p in 0..9 {
-            for q in p..9 {
-                let x = f64::from(rows[at]);
-                at += 1;
-                match (p < 8, q < 8) {
-                    (true, true) => normal[(p, q)] += x,
-                    (true, false) => right[p] += x,
-                    _ => sii += x,
-                }
-            }
+            at += 1;
         }
     }
-    n += normal[(7, 7)];
-    si += right[7];
+    let (n, si) = (normal[(7, 7)], right[7]);
     for p in 0..8 {
         for q in 0..p {
             normal[(p, q)] = normal[(q, p)];
@@ -459,4 +434,92 @@ fn solve(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Option<([f64;
         .iter()
         .all(|x| x.is_finite())
         .then_some((parameters, ncc))
+}
+
+/// Upper triangle of the normal equations of [`solve`], row by row: six motions, darkness, one,
+/// grey value.
+type Sums = [f64; 45];
+
+fn accumulate(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Sums {
+    #[cfg(target_arch = "x86_64")]
+    if std::arch::is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has AVX2.
+        return unsafe { accumulate_avx2(picture, seen, map) };
+    }
+    accumulate_plain(picture, seen, map)
+}
+
+/// The same with wider vectors.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn accumulate_avx2(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Sums {
+    accumulate_plain(picture, seen, map)
+}
+
+#[inline(always)]
+fn accumulate_plain(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Sums {
+    let mut sums = [0.0f64; 45];
+    let place = |k: usize, n: usize| {
+        let at_px = picture.origin_px[k] + n as f64 * picture.step_px - map.pixel_px[k];
+        (at_px / NORMALISE_PX) as f32
+    };
+    let step = (picture.step_px / NORMALISE_PX) as f32;
+    for j in 0..picture.height {
+        let v = place(1, j);
+        let line = seen.values(j);
+        let width = picture.width.min(line.len());
+        let mut rows = [[0.0f32; LANES]; 45];
+        for i in (0..width).step_by(LANES) {
+            let cells = j * picture.width + i..j * picture.width + (i + LANES).min(width);
+            let on = lane(&picture.mask[cells.clone()], |m| f32::from(u8::from(m)));
+            if on.iter().all(|&on| on == 0.0) {
+                continue;
+            }
+            let part = |of: &[f32]| {
+                let x = lane(&of[cells.clone()], |x| x);
+                each(|k| x[k] * on[k])
+            };
+            let (du, dv) = (part(&picture.du), part(&picture.dv));
+            let (gu, gv) = (each(|k| -du[k]), each(|k| -dv[k]));
+            let grey = lane(&line[i..i + cells.len()], SearchImage::grey);
+            let u = ramp(place(0, i), step);
+            let a = [
+                gu,
+                gv,
+                each(|k| gu[k] * u[k]),
+                each(|k| gu[k] * v),
+                each(|k| gv[k] * u[k]),
+                each(|k| gv[k] * v),
+                part(&picture.values),
+                on,
+                each(|k| grey[k] * on[k]),
+            ];
+            let mut at = 0;
+            for p in 0..9 {
+                for q in p..9 {
+                    for k in 0..LANES {
+                        rows[at][k] += a[p][k] * a[q][k];
+                    }
+                    at += 1;
+                }
+            }
+        }
+        for (s, r) in sums.iter_mut().zip(&rows) {
+            *s += f64::from(total(r));
+        }
+    }
+    sums
+}
+
+/// Up to [`LANES`] values, zeros after them.
+#[inline(always)]
+fn lane<T: Copy>(values: &[T], f: impl Fn(T) -> f32) -> Lane {
+    let mut out = [0.0; LANES];
+    if let Some(whole) = values.first_chunk::<LANES>() {
+        return each(|k| f(whole[k]));
+    }
+    for (o, &x) in out.iter_mut().zip(values) {
+        *o = f(x);
+    }
+    out
 }

@@ -7,7 +7,8 @@
 
 use nalgebra::{SMatrix, SVector, Vector2};
 
-use super::model::{LocalMap, MarkModel};
+use super::lanes::{LANES, Lane, MarkModel, each, ramp, total};
+use super::model::LocalMap;
 use super::{DetectionRules, PointKind};
 use crate::image::Image8;
 use crate::plate::PlateLayout;
@@ -286,53 +287,18 @@ fn gauss_newton_step(
     reach_px: f64,
     rules: &DetectionRules,
 ) -> Option<Step> {
-    let model = mark.model(map, blur_px)?;
-    let edge = EdgeDistance::new(mark, map);
-    let width = image.width_px as usize;
-    let (u0, u1) = (
-        (centre.x - reach_px).ceil() as usize,
-        (centre.x + reach_px) as usize,
-    );
-    let (v0, v1) = (
-        (centre.y - reach_px).ceil() as usize,
-        (centre.y + reach_px) as usize,
-    );
-    let margin = margin_px as f32 + 0.5;
-    let rim = (CHECKER_RIM * blur_px) as f32;
-    let window = rules.saddle_window_px as f32 + 0.5;
-    let (mut saturated, mut counted) = (0u32, 0u32);
-    let mut sums = [0.0f64; 21];
-    for v in v0..=v1 {
-        let dv = (v as f64 - centre.y) as f32;
-        let mut row = [0.0f32; 21];
-        let line = &image.pixels[v * width + u0..=v * width + u1];
-        for (i, &pixel) in line.iter().enumerate() {
-            let du = ((u0 + i) as f64 - centre.x) as f32;
-            let d = model.at(du, dv);
-            let weight = match mark.kind {
-                PointKind::Disc => margin - d.edge_px,
-                PointKind::Saddle => (-d.edge_px - rim).min(window - (du * du + dv * dv).sqrt()),
-            };
-            let weight = weight.min(edge.at(du, dv)).clamp(0.0, 1.0);
-            if weight <= 0.0 {
-                continue;
-            }
-            counted += 1;
-            saturated += u32::from(pixel >= rules.saturation_dn);
-            let a = [-d.du, -d.dv, d.value, 1.0, d.dsigma, f32::from(pixel)];
-            let mut at = 0;
-            for p in 0..6 {
-                let wp = weight * a[p];
-                for aq in &a[p..] {
-                    row[at] += wp * aq;
-                    at += 1;
-                }
-            }
-        }
-        for (s, r) in sums.iter_mut().zip(row) {
-            *s += f64::from(r);
-        }
-    }
+    let window = Window {
+        model: mark.model(map, blur_px)?,
+        edge: EdgeDistance::new(mark, map),
+        kind: mark.kind,
+        centre,
+        reach_px,
+        margin_px: margin_px as f32 + 0.5,
+        rim_px: (CHECKER_RIM * blur_px) as f32,
+        radius_px: rules.saddle_window_px as f32 + 0.5,
+        saturation_dn: f32::from(rules.saturation_dn) - MIDDLE_DN,
+    };
+    let (sums, saturated) = window.accumulate(image);
     let mut normal = SMatrix::<f64, 5, 5>::zeros();
     let mut right = SVector::<f64, 5>::zeros();
     let mut square = 0.0;
@@ -387,12 +353,136 @@ fn gauss_newton_step(
         shift: Vector2::new(x[0], x[1]) / gain,
         blur_shift: if free_blur { x[4] / gain } else { 0.0 },
         contrast_dn: -gain,
-        white_dn: x[3],
+        white_dn: x[3] + f64::from(MIDDLE_DN),
         rms_dn,
         sigma_px,
-        saturated: f64::from(saturated) / f64::from(counted.max(1)),
+        saturated,
         weight,
     })
+}
+
+/// The pixels around a mark's centre and what they are compared with.
+struct Window {
+    model: MarkModel,
+    edge: EdgeDistance,
+    kind: PointKind,
+    centre: Vector2<f64>,
+    reach_px: f64,
+    /// White beyond a disc's edge, px.
+    margin_px: f32,
+    /// Strip along the checker's border that is left out, px.
+    rim_px: f32,
+    /// Radius of the checker's window, px.
+    radius_px: f32,
+    /// See [`DetectionRules::saturation_dn`], less [`MIDDLE_DN`].
+    saturation_dn: f32,
+}
+
+/// Subtracted from the grey values, to keep the sums of their squares small, DN.
+const MIDDLE_DN: f32 = 128.0;
+
+/// Upper triangle of the normal equations, row by row: du, dv, darkness, one, blur, grey value.
+type Sums = [f64; 21];
+
+impl Window {
+    /// The sums over the window, and the fraction of its pixels that are saturated.
+    fn accumulate(&self, image: &Image8) -> (Sums, f64) {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            return unsafe { self.accumulate_avx2(image) };
+        }
+        self.accumulate_plain(image)
+    }
+
+    /// The same with wider vectors.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn accumulate_avx2(&self, image: &Image8) -> (Sums, f64) {
+        self.accumulate_plain(image)
+    }
+
+    #[inline(always)]
+    fn accumulate_plain(&self, image: &Image8) -> (Sums, f64) {
+        let width = image.width_px as usize;
+        let (centre, reach) = (self.centre, self.reach_px);
+        let rows = (centre.y - reach).ceil() as usize..=(centre.y + reach) as usize;
+        let (mut saturated, mut counted) = ([0.0f32; LANES], [0.0f32; LANES]);
+        let mut sums = [0.0f64; 21];
+        for v in rows {
+            let offset = v as f64 - centre.y;
+            // no pixel further away than the reach counts
+            let half = (reach * reach - offset * offset).max(0.0).sqrt();
+            let (first, last) = (
+                (centre.x - half).ceil() as usize,
+                (centre.x + half) as usize,
+            );
+            let dv = offset as f32;
+            let mut row = [[0.0f32; LANES]; 21];
+            for u in (first..=last).step_by(LANES) {
+                let du = ramp((u as f64 - centre.x) as f32, 1.0);
+                let d = self.model.at(&du, dv);
+                let weight = self.weights(&d.edge_px, &du, dv, (last - u) as f32);
+                let grey = greys(&image.pixels, v * width + u);
+                for k in 0..LANES {
+                    let on = if weight[k] > 0.0 { 1.0 } else { 0.0 };
+                    counted[k] += on;
+                    saturated[k] += if grey[k] >= self.saturation_dn { on } else { 0.0 };
+                }
+                let a = [
+                    each(|k| -d.du[k]),
+                    each(|k| -d.dv[k]),
+                    d.value,
+                    [1.0; LANES],
+                    d.dsigma,
+                    grey,
+                ];
+                let mut at = 0;
+                for p in 0..6 {
+                    let weighted = each(|k| weight[k] * a[p][k]);
+                    for aq in &a[p..] {
+                        for k in 0..LANES {
+                            row[at][k] += weighted[k] * aq[k];
+                        }
+                        at += 1;
+                    }
+                }
+            }
+            for (s, r) in sums.iter_mut().zip(&row) {
+                *s += f64::from(total(r));
+            }
+        }
+        let fraction = f64::from(total(&saturated)) / f64::from(total(&counted)).max(1.0);
+        (sums, fraction)
+    }
+
+    /// What pixels count for, 0 to 1; 0 from the lane after `last` on.
+    #[inline(always)]
+    fn weights(&self, edge_px: &Lane, du: &Lane, dv: f32, last: f32) -> Lane {
+        let lane = ramp(0.0, 1.0);
+        let own = match self.kind {
+            PointKind::Disc => each(|k| self.margin_px - edge_px[k]),
+            PointKind::Saddle => each(|k| {
+                let inside = self.radius_px - (du[k] * du[k] + dv * dv).sqrt();
+                (-edge_px[k] - self.rim_px).min(inside)
+            }),
+        };
+        let border = self.edge.at(du, dv);
+        each(|k| {
+            let weight = own[k].min(border[k]).max(0.0).min(1.0);
+            if lane[k] <= last { weight } else { 0.0 }
+        })
+    }
+}
+
+/// Grey values less [`MIDDLE_DN`] from `start` on; the last one again beyond the end.
+#[inline(always)]
+fn greys(pixels: &[u8], start: usize) -> Lane {
+    let bytes = match pixels[start..].first_chunk::<LANES>() {
+        Some(bytes) => *bytes,
+        None => std::array::from_fn(|k| pixels[(start + k).min(pixels.len() - 1)]),
+    };
+    each(|k| f32::from(bytes[k]) - MIDDLE_DN)
 }
 
 /// Distance (px, less the blurred strip) of a pixel from the plate's border, to first order.
@@ -423,12 +513,12 @@ impl EdgeDistance {
         }
     }
 
-    #[inline]
-    fn at(&self, du: f32, dv: f32) -> f32 {
-        let axis = |k: usize| {
-            let x = self.at[k] + self.along[k][0] * du + self.along[k][1] * dv;
-            self.half[k] - x.abs()
+    #[inline(always)]
+    fn at(&self, du: &Lane, dv: f32) -> Lane {
+        let axis = |i: usize, k: usize| {
+            let x = self.at[i] + self.along[i][0] * du[k] + self.along[i][1] * dv;
+            self.half[i] - x.abs()
         };
-        axis(0).min(axis(1)) - EDGE_STRIP_PX as f32
+        each(|k| axis(0, k).min(axis(1, k)) - EDGE_STRIP_PX as f32)
     }
 }

@@ -7,6 +7,7 @@
 //! no correction afterwards and a shadow, a reflection or an occlusion spoils single points only.
 
 mod align;
+mod lanes;
 mod mark;
 mod model;
 mod points;
@@ -19,8 +20,8 @@ use rover_cameras::Camera;
 use crate::image::Image8;
 use crate::plate::PlateLayout;
 
+pub(crate) use lanes::normal_at;
 pub use mark::PointFault;
-pub(crate) use model::normal_at;
 pub use pose::{PlatePose, estimate_plate_pose, estimate_plate_pose_single};
 pub(crate) use pose::{Sighting, solve_pose};
 pub use rules::DetectionRules;
