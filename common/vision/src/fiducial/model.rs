@@ -306,24 +306,27 @@ impl Picture {
         columns: Range<usize>,
         rows: Range<usize>,
     ) {
-        let mut add = |i: usize, j: usize, last: usize| {
-            let (du, dv) = self.offset(at_px, i, j);
-            let d = mark.at(&ramp(du, self.step_px as f32), dv);
-            let cells = j * self.width + i..j * self.width + last;
-            for (out, of) in [
-                (&mut self.values, &d.value),
-                (&mut self.du, &d.du),
-                (&mut self.dv, &d.dv),
-            ] {
-                for (o, x) in out[cells.clone()].iter_mut().zip(of) {
-                    *o += x;
-                }
-            }
-        };
         for j in rows {
             for i in columns.clone().step_by(LANES) {
-                add(i, j, (i + LANES).min(columns.end));
+                let (du, dv) = self.offset(at_px, i, j);
+                let d = mark.at(&ramp(du, self.step_px as f32), dv);
+                let cells = j * self.width + i..j * self.width + (i + LANES).min(columns.end);
+                add(&mut self.values[cells.clone()], &d.value);
+                add(&mut self.du[cells.clone()], &d.du);
+                add(&mut self.dv[cells], &d.dv);
             }
         }
+    }
+}
+
+/// Adds as many lanes as there are places.
+#[inline(always)]
+fn add(out: &mut [f32], lanes: &Lane) {
+    if let Some(whole) = out.first_chunk_mut::<LANES>() {
+        *whole = each(|k| whole[k] + lanes[k]);
+        return;
+    }
+    for (o, x) in out.iter_mut().zip(lanes) {
+        *o += x;
     }
 }
