@@ -73,6 +73,7 @@ fn align_step(
         origin,
         step,
         (width, height),
+        true,
     )?;
     let seen = SearchImage::new(
         image,
@@ -164,6 +165,9 @@ fn solve(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Option<([f64;
 /// grey value.
 type Sums = [f64; 45];
 
+/// Rows whose sums are held in single precision.
+const ROWS_AT_ONCE: usize = 4;
+
 fn accumulate(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Sums {
     #[cfg(target_arch = "x86_64")]
     if std::arch::is_x86_feature_detected!("avx2") {
@@ -188,43 +192,43 @@ fn accumulate_plain(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Su
         (at_px / NORMALISE_PX) as f32
     };
     let step = (picture.step_px / NORMALISE_PX) as f32;
-    for j in 0..picture.height {
-        let v = place(1, j);
-        let line = seen.values(j);
-        let width = picture.width.min(line.len());
+    for first_row in (0..picture.height).step_by(ROWS_AT_ONCE) {
         let mut rows = [[0.0f32; LANES]; 45];
-        for i in (0..width).step_by(LANES) {
-            let cells = j * picture.width + i..j * picture.width + (i + LANES).min(width);
-            let on = lane(&picture.mask[cells.clone()], |m| f32::from(u8::from(m)));
-            if on.iter().all(|&on| on == 0.0) {
-                continue;
-            }
-            let part = |of: &[f32]| {
-                let x = lane(&of[cells.clone()], |x| x);
-                each(|k| x[k] * on[k])
-            };
-            let (du, dv) = (part(&picture.du), part(&picture.dv));
-            let (gu, gv) = (each(|k| -du[k]), each(|k| -dv[k]));
-            let grey = lane(&line[i..i + cells.len()], SearchImage::grey);
-            let u = ramp(place(0, i), step);
-            let a = [
-                gu,
-                gv,
-                each(|k| gu[k] * u[k]),
-                each(|k| gu[k] * v),
-                each(|k| gv[k] * u[k]),
-                each(|k| gv[k] * v),
-                part(&picture.values),
-                on,
-                each(|k| grey[k] * on[k]),
-            ];
-            let mut at = 0;
-            for p in 0..9 {
-                for q in p..9 {
-                    for k in 0..LANES {
-                        rows[at][k] += a[p][k] * a[q][k];
+        for j in first_row..picture.height.min(first_row + ROWS_AT_ONCE) {
+            let v = place(1, j);
+            let line = seen.values(j);
+            let width = picture.width.min(line.len());
+            for i in (0..width).step_by(LANES) {
+                let cells = j * picture.width + i..j * picture.width + (i + LANES).min(width);
+                let on = lane(&picture.mask[cells.clone()], |m| f32::from(u8::from(m)));
+                if on.iter().all(|&on| on == 0.0) {
+                    continue;
+                }
+                let values = lane(&picture.values[cells.clone()], |x| x);
+                let du = lane(&picture.du[cells.clone()], |x| x);
+                let dv = lane(&picture.dv[cells.clone()], |x| x);
+                let grey = lane(&line[i..i + cells.len()], SearchImage::grey);
+                let u = ramp(place(0, i), step);
+                let (gu, gv) = (each(|k| -du[k] * on[k]), each(|k| -dv[k] * on[k]));
+                let a = [
+                    gu,
+                    gv,
+                    each(|k| gu[k] * u[k]),
+                    each(|k| gu[k] * v),
+                    each(|k| gv[k] * u[k]),
+                    each(|k| gv[k] * v),
+                    each(|k| values[k] * on[k]),
+                    on,
+                    each(|k| grey[k] * on[k]),
+                ];
+                let mut at = 0;
+                for p in 0..9 {
+                    for q in p..9 {
+                        for k in 0..LANES {
+                            rows[at][k] += a[p][k] * a[q][k];
+                        }
+                        at += 1;
                     }
-                    at += 1;
                 }
             }
         }

@@ -209,7 +209,7 @@ pub(super) struct MarkModel {
     normal: &'static Normal,
 }
 
-/// Steps of the table this far outside are 0 or 1.
+/// Distances, in blurs, at which the table has 0 or 1.
 const SURE: f32 = -NORMAL_REACH;
 
 impl MarkModel {

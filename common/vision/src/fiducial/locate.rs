@@ -299,7 +299,8 @@ impl Pattern {
         // its first pixel is drawn at the corner of the bounds
         let sigma_px = level_sigma(search.rules.blur_sigma_px, field.level);
         let layout = search.layout;
-        let picture = model::draw(layout, field.part, map, sigma_px, low, step, (width, height))?;
+        let size = (width, height);
+        let picture = model::draw(layout, field.part, map, sigma_px, low, step, size, false)?;
         // position i of the window has its first pixel's centre at corner + i step + (step - 1) / 2
         let corner = Vector2::from(field.corner_px.map(f64::from));
         let offset = (low - corner) / step - Vector2::repeat((step - 1.0) / (2.0 * step));

@@ -298,20 +298,23 @@ fn gauss_newton_step(
         radius_px: rules.saddle_window_px as f32 + 0.5,
         saturation_dn: f32::from(rules.saturation_dn) - MIDDLE_DN,
     };
-    let (sums, saturated) = window.accumulate(image);
+    let (sums, saturated) = window.accumulate(image, free_blur);
     let mut normal = SMatrix::<f64, 5, 5>::zeros();
     let mut right = SVector::<f64, 5>::zeros();
     let mut square = 0.0;
     let mut at = 0;
     for p in 0..6 {
-        for q in p..6 {
-            match (p < 5, q < 5) {
-                (true, true) => {
-                    normal[(p, q)] = sums[at];
-                    normal[(q, p)] = sums[at];
+        for q in 0..=p {
+            // the blur is the last of the unknowns
+            let unknown = |k: usize| if k == 5 { 4 } else { k };
+            match (p == GREY, q == GREY) {
+                (false, false) => {
+                    normal[(unknown(p), unknown(q))] = sums[at];
+                    normal[(unknown(q), unknown(p))] = sums[at];
                 }
-                (true, false) => right[p] = sums[at],
-                _ => square = sums[at],
+                (true, true) => square = sums[at],
+                (true, false) => right[unknown(q)] = sums[at],
+                (false, true) => right[unknown(p)] = sums[at],
             }
             at += 1;
         }
@@ -345,10 +348,8 @@ fn gauss_newton_step(
     }
     let freedom = (weight - 5.0).max(1.0);
     let rms_dn = ((square - x.dot(&right)).max(0.0) / freedom).sqrt();
-    let covariance = factor.inverse();
-    let mean_variance = 0.5 * (covariance[(0, 0)] + covariance[(1, 1)]);
     // quantisation alone is 0.29 DN
-    let sigma_px = rms_dn.max(0.29) * mean_variance.sqrt() / gain.abs();
+    let sigma_px = rms_dn.max(0.29) * mean_variance(&factor.l()).sqrt() / gain.abs();
     Some(Step {
         shift: Vector2::new(x[0], x[1]) / gain,
         blur_shift: if free_blur { x[4] / gain } else { 0.0 },
@@ -359,6 +360,25 @@ fn gauss_newton_step(
         saturated,
         weight,
     })
+}
+
+/// Mean of the first two diagonal elements of (L L^T)^-1.
+fn mean_variance(l: &SMatrix<f64, 5, 5>) -> f64 {
+    let variance = |first: usize| {
+        // the column of L^-1, whose square is the element
+        let mut column = [0.0; 5];
+        let mut sum = 0.0;
+        for i in first..5 {
+            let mut x = f64::from(u8::from(i == first));
+            for j in first..i {
+                x -= l[(i, j)] * column[j];
+            }
+            column[i] = x / l[(i, i)];
+            sum += column[i] * column[i];
+        }
+        sum
+    };
+    0.5 * (variance(0) + variance(1))
 }
 
 /// The pixels around a mark's centre and what they are compared with.
@@ -381,74 +401,96 @@ struct Window {
 /// Subtracted from the grey values, to keep the sums of their squares small, DN.
 const MIDDLE_DN: f32 = 128.0;
 
-/// Upper triangle of the normal equations, row by row: du, dv, darkness, one, blur, grey value.
+/// Lower triangle of the normal equations, row by row: du, dv, darkness, one, grey value, blur.
 type Sums = [f64; 21];
+/// Place of the grey value among them.
+const GREY: usize = 4;
+
+/// Rows whose sums are held in single precision.
+const ROWS_AT_ONCE: usize = 4;
 
 impl Window {
-    /// The sums over the window, and the fraction of its pixels that are saturated.
-    fn accumulate(&self, image: &Image8) -> (Sums, f64) {
+    /// The sums over the window, those with the blur only if it is free, and the fraction of the
+    /// pixels that are saturated.
+    fn accumulate(&self, image: &Image8, free_blur: bool) -> (Sums, f64) {
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") {
             // SAFETY: the processor has AVX2.
-            return unsafe { self.accumulate_avx2(image) };
+            return unsafe {
+                if free_blur {
+                    self.accumulate_avx2::<6>(image)
+                } else {
+                    self.accumulate_avx2::<5>(image)
+                }
+            };
         }
-        self.accumulate_plain(image)
+        if free_blur {
+            self.accumulate_plain::<6>(image)
+        } else {
+            self.accumulate_plain::<5>(image)
+        }
     }
 
     /// The same with wider vectors.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
-    fn accumulate_avx2(&self, image: &Image8) -> (Sums, f64) {
-        self.accumulate_plain(image)
+    fn accumulate_avx2<const COLUMNS: usize>(&self, image: &Image8) -> (Sums, f64) {
+        self.accumulate_plain::<COLUMNS>(image)
     }
 
     #[inline(always)]
-    fn accumulate_plain(&self, image: &Image8) -> (Sums, f64) {
+    fn accumulate_plain<const COLUMNS: usize>(&self, image: &Image8) -> (Sums, f64) {
         let width = image.width_px as usize;
         let (centre, reach) = (self.centre, self.reach_px);
-        let rows = (centre.y - reach).ceil() as usize..=(centre.y + reach) as usize;
+        let (top, bottom) = (
+            (centre.y - reach).ceil() as usize,
+            (centre.y + reach) as usize,
+        );
         let (mut saturated, mut counted) = ([0.0f32; LANES], [0.0f32; LANES]);
         let mut sums = [0.0f64; 21];
-        for v in rows {
-            let offset = v as f64 - centre.y;
-            // no pixel further away than the reach counts
-            let half = (reach * reach - offset * offset).max(0.0).sqrt();
-            let (first, last) = (
-                (centre.x - half).ceil() as usize,
-                (centre.x + half) as usize,
-            );
-            let dv = offset as f32;
-            let mut row = [[0.0f32; LANES]; 21];
-            for u in (first..=last).step_by(LANES) {
-                let du = ramp((u as f64 - centre.x) as f32, 1.0);
-                let d = self.model.at(&du, dv);
-                let weight = self.weights(&d.edge_px, &du, dv, (last - u) as f32);
-                let grey = greys(&image.pixels, v * width + u);
-                for k in 0..LANES {
-                    let on = if weight[k] > 0.0 { 1.0 } else { 0.0 };
-                    counted[k] += on;
-                    saturated[k] += if grey[k] >= self.saturation_dn { on } else { 0.0 };
-                }
-                let a = [
-                    each(|k| -d.du[k]),
-                    each(|k| -d.dv[k]),
-                    d.value,
-                    [1.0; LANES],
-                    d.dsigma,
-                    grey,
-                ];
-                let mut at = 0;
-                for p in 0..6 {
-                    let weighted = each(|k| weight[k] * a[p][k]);
-                    for aq in &a[p..] {
-                        for k in 0..LANES {
-                            row[at][k] += weighted[k] * aq[k];
+        for first_row in (top..=bottom).step_by(ROWS_AT_ONCE) {
+            let mut rows = [[0.0f32; LANES]; 21];
+            for v in first_row..=bottom.min(first_row + ROWS_AT_ONCE - 1) {
+                let offset = v as f64 - centre.y;
+                // no pixel further away than the reach counts
+                let half = (reach * reach - offset * offset).max(0.0).sqrt();
+                let (first, last) = (
+                    (centre.x - half).ceil() as usize,
+                    (centre.x + half) as usize,
+                );
+                let dv = offset as f32;
+                for u in (first..=last).step_by(LANES) {
+                    let du = ramp((u as f64 - centre.x) as f32, 1.0);
+                    let d = self.model.at(&du, dv);
+                    let weight = self.weights(&d.edge_px, &du, dv, (last - u) as f32);
+                    let grey = greys(&image.pixels, v * width + u);
+                    for k in 0..LANES {
+                        let on = if weight[k] > 0.0 { 1.0 } else { 0.0 };
+                        let clipped = grey[k] >= self.saturation_dn;
+                        counted[k] += on;
+                        saturated[k] += if clipped { on } else { 0.0 };
+                    }
+                    let a = [
+                        each(|k| -d.du[k]),
+                        each(|k| -d.dv[k]),
+                        d.value,
+                        [1.0; LANES],
+                        grey,
+                        d.dsigma,
+                    ];
+                    let mut at = 0;
+                    for p in 0..COLUMNS {
+                        let weighted = each(|k| weight[k] * a[p][k]);
+                        for aq in &a[..=p] {
+                            for k in 0..LANES {
+                                rows[at][k] += weighted[k] * aq[k];
+                            }
+                            at += 1;
                         }
-                        at += 1;
                     }
                 }
             }
-            for (s, r) in sums.iter_mut().zip(&row) {
+            for (s, r) in sums.iter_mut().zip(&rows) {
                 *s += f64::from(total(r));
             }
         }

@@ -121,7 +121,7 @@ pub(super) struct Picture {
     pub step_px: f64,
     /// Darkness, 0 to 1.
     pub values: Vec<f32>,
-    /// Derivatives per image px.
+    /// Derivatives per image px; empty if they were not asked for.
     pub du: Vec<f32>,
     pub dv: Vec<f32>,
     /// Whether the pixel shows the part, at least one blur radius inside its edge.
@@ -165,8 +165,9 @@ pub(super) fn bounds(
     (low, high)
 }
 
-/// Draws a part. The grid starts at `origin_px`; `sigma_px` is the blur in image px. `None` if the
-/// map is degenerate.
+/// Draws a part, with its derivatives if `slopes`. The grid starts at `origin_px`; `sigma_px` is the
+/// blur in image px. `None` if the map is degenerate.
+#[allow(clippy::too_many_arguments)] // what a picture is made of
 pub(super) fn draw(
     layout: &PlateLayout,
     part: Part,
@@ -175,16 +176,18 @@ pub(super) fn draw(
     origin_px: Vector2<f64>,
     step_px: f64,
     (width, height): (usize, usize),
+    slopes: bool,
 ) -> Option<Picture> {
     let count = width * height;
+    let sloped = if slopes { count } else { 0 };
     let mut picture = Picture {
         width,
         height,
         origin_px,
         step_px,
         values: vec![0.0; count],
-        du: vec![0.0; count],
-        dv: vec![0.0; count],
+        du: vec![0.0; sloped],
+        dv: vec![0.0; sloped],
         mask: vec![false; count],
     };
     let (centre, half) = extent(layout, part);
@@ -282,7 +285,7 @@ impl Picture {
             // SAFETY: the processor has AVX2.
             return unsafe { self.add_avx2(mark, &local.pixel_px, columns, rows) };
         }
-        self.add_plain(mark, &local.pixel_px, columns, rows);
+        self.add_either(mark, &local.pixel_px, columns, rows);
     }
 
     /// The same with wider vectors.
@@ -295,11 +298,26 @@ impl Picture {
         columns: Range<usize>,
         rows: Range<usize>,
     ) {
-        self.add_plain(mark, at_px, columns, rows);
+        self.add_either(mark, at_px, columns, rows);
     }
 
     #[inline(always)]
-    fn add_plain(
+    fn add_either(
+        &mut self,
+        mark: &MarkModel,
+        at_px: &Vector2<f64>,
+        columns: Range<usize>,
+        rows: Range<usize>,
+    ) {
+        if self.du.is_empty() {
+            self.add_plain::<false>(mark, at_px, columns, rows);
+        } else {
+            self.add_plain::<true>(mark, at_px, columns, rows);
+        }
+    }
+
+    #[inline(always)]
+    fn add_plain<const SLOPES: bool>(
         &mut self,
         mark: &MarkModel,
         at_px: &Vector2<f64>,
@@ -312,8 +330,10 @@ impl Picture {
                 let d = mark.at(&ramp(du, self.step_px as f32), dv);
                 let cells = j * self.width + i..j * self.width + (i + LANES).min(columns.end);
                 add(&mut self.values[cells.clone()], &d.value);
-                add(&mut self.du[cells.clone()], &d.du);
-                add(&mut self.dv[cells], &d.dv);
+                if SLOPES {
+                    add(&mut self.du[cells.clone()], &d.du);
+                    add(&mut self.dv[cells], &d.dv);
+                }
             }
         }
     }

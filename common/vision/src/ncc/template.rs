@@ -44,6 +44,8 @@ pub struct Template {
     pub(super) height: usize,
     pub(super) stride: usize,
     pub(super) values: Vec<i16>,
+    /// 1 inside the mask and 0 outside, laid out as `values`; empty if all is inside.
+    pub(super) mask: Vec<i16>,
     pub(super) spans: Vec<Span>,
     pub(super) rectangular: bool,
     pub(super) count: usize,
@@ -81,6 +83,16 @@ fn spans_of(mask: &[bool], width: usize) -> Vec<Span> {
     spans
 }
 
+/// One run for each row.
+fn whole_rows(width: usize, height: usize) -> Vec<Span> {
+    let whole = |row| Span {
+        row,
+        start: 0,
+        end: width,
+    };
+    (0..height).map(whole).collect()
+}
+
 /// Most pixels in a template.
 const MAX_COUNT: usize = 65_536;
 
@@ -109,30 +121,27 @@ impl Template {
         {
             return Err(wrong(mask.len()));
         }
-        let inside = |i: usize| mask.is_none_or(|m| m[i]);
-        let count = mask.map_or(values.len(), |m| m.iter().filter(|&&on| on).count());
+        let spans = mask.map_or_else(|| whole_rows(width, height), |m| spans_of(m, width));
+        let count = spans.iter().map(|s| s.end - s.start).sum();
         if !(2..=MAX_COUNT).contains(&count) {
             return Err(TemplateError::BadCount {
                 found: count,
                 limit: MAX_COUNT,
             });
         }
-        let chosen = || {
-            values
-                .iter()
-                .enumerate()
-                .filter(|&(i, _)| inside(i))
-                .map(|(_, &x)| x)
-        };
+        let run = |s: &Span| s.row * width + s.start..s.row * width + s.end;
+        let chosen = || spans.iter().flat_map(|s| &values[run(s)]);
         let n = count as f64;
-        let mean = chosen().map(f64::from).sum::<f64>() / n;
+        let mut total = 0.0f64;
+        chosen().for_each(|&x| total += f64::from(x));
+        let mean = total / n;
         let (mut largest, mut size_sum, mut square_sum) = (0.0f64, 0.0f64, 0.0f64);
-        for x in chosen() {
+        chosen().for_each(|&x| {
             let d = f64::from(x) - mean;
             largest = largest.max(d.abs());
             size_sum += d.abs();
             square_sum += d * d;
-        }
+        });
         let deviation = (square_sum / n).sqrt();
         if !deviation.is_finite() || deviation <= 1e-6 * (1.0 + mean.abs()) {
             return Err(TemplateError::NoContrast(deviation));
@@ -143,17 +152,25 @@ impl Template {
         let stride = width.div_ceil(LANES) * LANES;
         let mut quantised = vec![0i16; stride * height];
         let (mut sum, mut square) = (0i64, 0i64);
-        let lines = quantised
-            .chunks_exact_mut(stride)
-            .zip(values.chunks_exact(width));
-        for (row, (out, line)) in lines.enumerate() {
-            for (column, (o, &x)) in out.iter_mut().zip(line).enumerate() {
-                if inside(row * width + column) {
-                    let q = round_to_i16((x - mean as f32) * gain);
-                    *o = q;
-                    sum += i64::from(q);
-                    square += i64::from(i32::from(q) * i32::from(q));
-                }
+        for s in &spans {
+            let out = &mut quantised[s.row * stride + s.start..s.row * stride + s.end];
+            // a row's values are at most 4096, and there are at most 65536 of them
+            let (mut row_sum, mut row_square) = (0i32, 0i64);
+            for (o, &x) in out.iter_mut().zip(&values[run(s)]) {
+                let q = round_to_i16((x - mean as f32) * gain);
+                *o = q;
+                row_sum += i32::from(q);
+                row_square += i64::from(i32::from(q) * i32::from(q));
+            }
+            sum += i64::from(row_sum);
+            square += row_square;
+        }
+        let rectangular = count == width * height;
+        let mut mask = Vec::new();
+        if !rectangular {
+            mask = vec![0i16; stride * height];
+            for s in &spans {
+                mask[s.row * stride + s.start..s.row * stride + s.end].fill(1);
             }
         }
         // Rounding leaves a small mean; the score takes it into account.
@@ -163,8 +180,9 @@ impl Template {
             height,
             stride,
             values: quantised,
-            spans: mask.map_or_else(Vec::new, |m| spans_of(m, width)),
-            rectangular: count == width * height,
+            mask,
+            spans,
+            rectangular,
             count,
             mean: sum as f64 / n,
             norm,
