@@ -3,7 +3,7 @@
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
 use super::PlateSearch;
-use super::lanes::{LANES, Lane, each, ramp, total};
+use super::lanes::{LANES, Lane, add_products, each, ramp, total};
 use super::locate::{Candidate, level_sigma};
 use super::model::{self, LocalMap, Part, Picture};
 use crate::image::Image8;
@@ -112,21 +112,19 @@ fn solve(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Option<([f64;
     let mut sii = 0.0;
     let mut at = 0;
     for p in 0..9 {
-        for q in p..9 {
+        for q in 0..=p {
             match (p < 8, q < 8) {
-                (true, true) => normal[(p, q)] = sums[at],
-                (true, false) => right[p] = sums[at],
+                (true, true) => {
+                    normal[(p, q)] = sums[at];
+                    normal[(q, p)] = sums[at];
+                }
+                (false, true) => right[q] = sums[at],
                 _ => sii = sums[at],
             }
             at += 1;
         }
     }
     let (n, si) = (normal[(7, 7)], right[7]);
-    for p in 0..8 {
-        for q in 0..p {
-            normal[(p, q)] = normal[(q, p)];
-        }
-    }
     if n < 20.0 {
         return None;
     }
@@ -161,7 +159,7 @@ fn solve(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Option<([f64;
         .then_some((parameters, ncc))
 }
 
-/// Upper triangle of the normal equations of [`solve`], row by row: six motions, darkness, one,
+/// Lower triangle of the normal equations of [`solve`], row by row: six motions, darkness, one,
 /// grey value.
 type Sums = [f64; 45];
 
@@ -221,15 +219,15 @@ fn accumulate_plain(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Su
                     on,
                     each(|k| grey[k] * on[k]),
                 ];
-                let mut at = 0;
-                for p in 0..9 {
-                    for q in p..9 {
-                        for k in 0..LANES {
-                            rows[at][k] += a[p][k] * a[q][k];
-                        }
-                        at += 1;
-                    }
-                }
+                add_products::<0>(&mut rows, &a, &a[0]);
+                add_products::<1>(&mut rows, &a, &a[1]);
+                add_products::<2>(&mut rows, &a, &a[2]);
+                add_products::<3>(&mut rows, &a, &a[3]);
+                add_products::<4>(&mut rows, &a, &a[4]);
+                add_products::<5>(&mut rows, &a, &a[5]);
+                add_products::<6>(&mut rows, &a, &a[6]);
+                add_products::<7>(&mut rows, &a, &a[7]);
+                add_products::<8>(&mut rows, &a, &a[8]);
             }
         }
         for (s, r) in sums.iter_mut().zip(&rows) {

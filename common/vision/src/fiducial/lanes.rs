@@ -31,6 +31,28 @@ pub(super) fn ramp(first: f32, step: f32) -> Lane {
     each(|k| first + step * COUNT[k])
 }
 
+/// The larger of two numbers, the second one beside a NaN: a single instruction.
+#[inline(always)]
+pub(super) fn larger(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
+}
+
+/// The smaller of two numbers, the second one beside a NaN: a single instruction.
+#[inline(always)]
+pub(super) fn smaller(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}
+
+/// Adds the products of column `P` of a design matrix and the columns before it to row `P` of the
+/// lower triangle of the normal equations.
+#[inline(always)]
+pub(super) fn add_products<const P: usize>(sums: &mut [Lane], columns: &[Lane], weighted: &Lane) {
+    let first = P * (P + 1) / 2;
+    for (sum, column) in sums[first..=first + P].iter_mut().zip(&columns[..=P]) {
+        *sum = each(|k| sum[k] + weighted[k] * column[k]);
+    }
+}
+
 /// The sum over the lanes.
 #[inline(always)]
 pub(super) fn total(x: &Lane) -> f32 {
@@ -78,8 +100,8 @@ fn normal() -> &'static Normal {
 /// Index of the table's entry at or before `x`, and the rest in steps of the table.
 #[inline(always)]
 fn place(x: f32) -> (i32, f32) {
-    // `max` takes the bound for a NaN
-    let t = (x.max(-NORMAL_REACH).min(NORMAL_REACH) + NORMAL_REACH) * NORMAL_STEPS;
+    // a NaN becomes the lower bound
+    let t = (smaller(larger(x, -NORMAL_REACH), NORMAL_REACH) + NORMAL_REACH) * NORMAL_STEPS;
     // SAFETY: t is 0 to 2 * NORMAL_REACH * NORMAL_STEPS.
     let i = unsafe { t.to_int_unchecked::<i32>() };
     (i, t - i as f32)
@@ -254,7 +276,7 @@ impl MarkModel {
         let gu = each(|k| x[k] * i[0][0] + y[k] * i[1][0]);
         let gv = each(|k| x[k] * i[0][1] + y[k] * i[1][1]);
         // at the very centre there is no direction outwards; it is deep inside
-        let over = each(|k| 1.0 / (gu[k] * gu[k] + gv[k] * gv[k]).max(1e-30).sqrt());
+        let over = each(|k| 1.0 / larger(gu[k] * gu[k] + gv[k] * gv[k], 1e-30).sqrt());
         let edge_px = each(|k| {
             let size = self.size_m * d[k];
             let edge = (radius[k] - size) * radius[k] * over[k];
@@ -291,7 +313,7 @@ impl MarkModel {
         let inner = each(|k| 0.5 + 0.5 * ex[k] * ey[k]);
         let edge = |q: &Lane, r: usize| each(|k| (q[k].abs() - self.size_m * d[k]) * over[r]);
         let (edge_x, edge_y) = (edge(&x, 0), edge(&y, 1));
-        let edge_px = each(|k| edge_x[k].max(edge_y[k]));
+        let edge_px = each(|k| larger(edge_x[k], edge_y[k]));
         let mut dark = Darkness {
             value: inner,
             du: each(|k| rate_x[k] * unit[0][0] + rate_y[k] * unit[1][0]),

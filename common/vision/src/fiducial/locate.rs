@@ -402,24 +402,35 @@ fn glance(field: &Field, map: &LocalMap) -> Vec<Candidate> {
     };
     let mut found: Vec<Candidate> = places
         .iter()
-        .filter_map(|&place| {
-            let at = [0, 1].map(|k| pattern.around(field, k, place[k]));
-            if at.iter().any(|p| p.count < 3) {
-                return None;
-            }
-            let window = field.part_of_window(at, pattern.size(), 0);
-            let scores = score_map(&window, &template, 0, 0, at[0].count, at[1].count)?;
-            let peak = scores.peaks(1).into_iter().next()?;
-            // at the border a neighbour may be higher
-            let inside = |i: usize, count: usize| i > 0 && i + 1 < count;
-            if !(inside(peak.0, scores.width) && inside(peak.1, scores.height)) {
-                return None;
-            }
-            pattern.candidate(field, &scores, peak, at.map(|p| p.first))
-        })
+        .filter_map(|&place| climb(field, &pattern, &template, place))
         .collect();
     found.sort_by(|a, b| b.score.total_cmp(&a.score));
     found
+}
+
+/// The peak of the scores close to a position in the window.
+fn climb(
+    field: &Field,
+    pattern: &Pattern,
+    template: &Template,
+    place: [usize; 2],
+) -> Option<Candidate> {
+    let at = [0, 1].map(|k| pattern.around(field, k, place[k]));
+    let window = field.part_of_window(at, pattern.size(), 0);
+    let mut middle = [0, 1].map(|k| place[k].saturating_sub(at[k].first));
+    for _ in 0..GLANCE_ROUND {
+        // at the border a neighbour may be higher
+        if (0..2).any(|k| middle[k] == 0 || middle[k] + 1 >= at[k].count) {
+            return None;
+        }
+        let scores = score_map(&window, template, middle[0] - 1, middle[1] - 1, 3, 3)?;
+        let (i, j, score) = scores.best()?;
+        if (i, j) == (1, 1) {
+            return pattern.candidate(field, &scores, (i, j, score), at.map(|p| p.first));
+        }
+        middle = [middle[0] + i - 1, middle[1] + j - 1];
+    }
+    None
 }
 
 /// The pattern, and the positions in the window of its best places at half the resolution.

@@ -7,7 +7,9 @@
 
 use nalgebra::{SMatrix, SVector, Vector2};
 
-use super::lanes::{LANES, Lane, MarkModel, each, ramp, total};
+use super::lanes::{
+    LANES, Lane, MarkModel, add_products, each, larger, ramp, smaller, total,
+};
 use super::model::LocalMap;
 use super::{DetectionRules, PointKind};
 use crate::image::Image8;
@@ -418,28 +420,28 @@ impl Window {
             // SAFETY: the processor has AVX2.
             return unsafe {
                 if free_blur {
-                    self.accumulate_avx2::<6>(image)
+                    self.accumulate_avx2::<true>(image)
                 } else {
-                    self.accumulate_avx2::<5>(image)
+                    self.accumulate_avx2::<false>(image)
                 }
             };
         }
         if free_blur {
-            self.accumulate_plain::<6>(image)
+            self.accumulate_plain::<true>(image)
         } else {
-            self.accumulate_plain::<5>(image)
+            self.accumulate_plain::<false>(image)
         }
     }
 
     /// The same with wider vectors.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
-    fn accumulate_avx2<const COLUMNS: usize>(&self, image: &Image8) -> (Sums, f64) {
-        self.accumulate_plain::<COLUMNS>(image)
+    fn accumulate_avx2<const BLUR: bool>(&self, image: &Image8) -> (Sums, f64) {
+        self.accumulate_plain::<BLUR>(image)
     }
 
     #[inline(always)]
-    fn accumulate_plain<const COLUMNS: usize>(&self, image: &Image8) -> (Sums, f64) {
+    fn accumulate_plain<const BLUR: bool>(&self, image: &Image8) -> (Sums, f64) {
         let width = image.width_px as usize;
         let (centre, reach) = (self.centre, self.reach_px);
         let (top, bottom) = (
@@ -464,12 +466,11 @@ impl Window {
                     let d = self.model.at(&du, dv);
                     let weight = self.weights(&d.edge_px, &du, dv, (last - u) as f32);
                     let grey = greys(&image.pixels, v * width + u);
-                    for k in 0..LANES {
-                        let on = if weight[k] > 0.0 { 1.0 } else { 0.0 };
-                        let clipped = grey[k] >= self.saturation_dn;
-                        counted[k] += on;
-                        saturated[k] += if clipped { on } else { 0.0 };
-                    }
+                    let on = each(|k| if weight[k] > 0.0 { 1.0 } else { 0.0 });
+                    let clipped =
+                        each(|k| if grey[k] >= self.saturation_dn { 1.0 } else { 0.0 });
+                    counted = each(|k| counted[k] + on[k]);
+                    saturated = each(|k| saturated[k] + on[k] * clipped[k]);
                     let a = [
                         each(|k| -d.du[k]),
                         each(|k| -d.dv[k]),
@@ -478,15 +479,14 @@ impl Window {
                         grey,
                         d.dsigma,
                     ];
-                    let mut at = 0;
-                    for p in 0..COLUMNS {
-                        let weighted = each(|k| weight[k] * a[p][k]);
-                        for aq in &a[..=p] {
-                            for k in 0..LANES {
-                                rows[at][k] += weighted[k] * aq[k];
-                            }
-                            at += 1;
-                        }
+                    let weighted = |p: usize| each(|k| weight[k] * a[p][k]);
+                    add_products::<0>(&mut rows, &a, &weighted(0));
+                    add_products::<1>(&mut rows, &a, &weighted(1));
+                    add_products::<2>(&mut rows, &a, &weighted(2));
+                    add_products::<3>(&mut rows, &a, &weight);
+                    add_products::<4>(&mut rows, &a, &weighted(4));
+                    if BLUR {
+                        add_products::<5>(&mut rows, &a, &weighted(5));
                     }
                 }
             }
@@ -506,12 +506,12 @@ impl Window {
             PointKind::Disc => each(|k| self.margin_px - edge_px[k]),
             PointKind::Saddle => each(|k| {
                 let inside = self.radius_px - (du[k] * du[k] + dv * dv).sqrt();
-                (-edge_px[k] - self.rim_px).min(inside)
+                smaller(-edge_px[k] - self.rim_px, inside)
             }),
         };
         let border = self.edge.at(du, dv);
         each(|k| {
-            let weight = own[k].min(border[k]).max(0.0).min(1.0);
+            let weight = smaller(larger(smaller(own[k], border[k]), 0.0), 1.0);
             if lane[k] <= last { weight } else { 0.0 }
         })
     }
@@ -561,6 +561,6 @@ impl EdgeDistance {
             let x = self.at[i] + self.along[i][0] * du[k] + self.along[i][1] * dv;
             self.half[i] - x.abs()
         };
-        each(|k| axis(0, k).min(axis(1, k)) - EDGE_STRIP_PX as f32)
+        each(|k| smaller(axis(0, k), axis(1, k)) - EDGE_STRIP_PX as f32)
     }
 }

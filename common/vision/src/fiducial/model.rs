@@ -7,7 +7,7 @@ use nalgebra::{Isometry3, Matrix2, Matrix3x2, Vector2, Vector3};
 use rover_cameras::Camera;
 
 use super::NotFound;
-use super::lanes::{Inverse, LANES, Lane, MarkModel, each, ramp};
+use super::lanes::{Inverse, LANES, Lane, MarkModel, each, ramp, smaller};
 use crate::plate::PlateLayout;
 
 /// Least cosine between the plate's normal and the direction to the camera: 80 degrees.
@@ -256,10 +256,14 @@ impl Picture {
                 let [x, y, d] = inverse.at(&ramp(du, self.step_px as f32), dv);
                 let inside: Lane = each(|k| {
                     let a = half[0] * d[k] - x[k].abs() - least[0];
-                    a.min(half[1] * d[k] - y[k].abs() - least[1])
+                    smaller(a, half[1] * d[k] - y[k].abs() - least[1])
                 });
                 let last = (i + LANES).min(self.width);
                 let out = &mut self.mask[j * self.width + i..j * self.width + last];
+                if let Some(whole) = out.first_chunk_mut::<LANES>() {
+                    *whole = inside.map(|x| x >= 0.0);
+                    continue;
+                }
                 for (o, x) in out.iter_mut().zip(inside) {
                     *o = x >= 0.0;
                 }

@@ -93,6 +93,26 @@ fn whole_rows(width: usize, height: usize) -> Vec<Span> {
     (0..height).map(whole).collect()
 }
 
+/// Two sums over values, in four parts each, which need not wait for each other.
+fn sums(values: &[f32], of: impl Fn(f64) -> [f64; 2]) -> [f64; 2] {
+    let (mut a, mut b) = ([0.0f64; 4], [0.0f64; 4]);
+    let fours = values.chunks_exact(4);
+    let rest = fours.remainder();
+    for four in fours {
+        for k in 0..4 {
+            let [x, y] = of(f64::from(four[k]));
+            a[k] += x;
+            b[k] += y;
+        }
+    }
+    for (k, &x) in rest.iter().enumerate() {
+        let [x, y] = of(f64::from(x));
+        a[k] += x;
+        b[k] += y;
+    }
+    [a, b].map(|x| (x[0] + x[1]) + (x[2] + x[3]))
+}
+
 /// Most pixels in a template.
 const MAX_COUNT: usize = 65_536;
 
@@ -130,18 +150,17 @@ impl Template {
             });
         }
         let run = |s: &Span| s.row * width + s.start..s.row * width + s.end;
-        let chosen = || spans.iter().flat_map(|s| &values[run(s)]);
+        let mut chosen = Vec::with_capacity(count);
+        for s in &spans {
+            chosen.extend_from_slice(&values[run(s)]);
+        }
         let n = count as f64;
-        let mut total = 0.0f64;
-        chosen().for_each(|&x| total += f64::from(x));
-        let mean = total / n;
-        let (mut largest, mut size_sum, mut square_sum) = (0.0f64, 0.0f64, 0.0f64);
-        chosen().for_each(|&x| {
-            let d = f64::from(x) - mean;
-            largest = largest.max(d.abs());
-            size_sum += d.abs();
-            square_sum += d * d;
+        let mean = sums(&chosen, |x| [x, 0.0])[0] / n;
+        let [size_sum, square_sum] = sums(&chosen, |x| [(x - mean).abs(), (x - mean) * (x - mean)]);
+        let (low, high) = chosen.iter().fold((f32::MAX, f32::MIN), |(low, high), &x| {
+            (low.min(x), high.max(x))
         });
+        let largest = (f64::from(high) - mean).max(mean - f64::from(low));
         let deviation = (square_sum / n).sqrt();
         if !deviation.is_finite() || deviation <= 1e-6 * (1.0 + mean.abs()) {
             return Err(TemplateError::NoContrast(deviation));
