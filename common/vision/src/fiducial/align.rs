@@ -10,8 +10,9 @@ use crate::image::Image8;
 use crate::ncc::SearchImage;
 
 const MAX_STEPS: usize = 8;
-/// Alignment stops when a step moves the part's corners by less, px of the level.
-const SETTLED_PX: f64 = 0.02;
+/// Alignment stops when a step moves the part's corners by less, px of the level; the fits of the
+/// marks do the rest.
+const SETTLED_PX: f64 = 0.05;
 
 /// Aligns position, rotation, size and shear level by level; `None` if it runs away.
 pub(super) fn refine(

@@ -489,4 +489,3 @@ pub(super) fn level_sigma(sigma_px: f64, level: u32) -> f64 {
     // the full-resolution blur already holds one pixel's box
     (sigma_px * sigma_px + (step * step - 1.0) * BOX_VARIANCE).sqrt()
 }
-

@@ -7,9 +7,7 @@
 
 use nalgebra::{SMatrix, SVector, Vector2};
 
-use super::lanes::{
-    LANES, Lane, MarkModel, add_products, each, larger, ramp, smaller, total,
-};
+use super::lanes::{LANES, Lane, MarkModel, add_products, each, larger, ramp, smaller, total};
 use super::model::LocalMap;
 use super::{DetectionRules, PointKind};
 use crate::image::Image8;
@@ -98,6 +96,8 @@ pub(super) struct MarkFit {
 const MAX_STEPS: usize = 10;
 /// A fit has settled when its last step was shorter than this, px; what remains is far smaller.
 const SETTLED_PX: f64 = 0.005;
+/// The same with a known blur and the place from the pose of all marks: what remains is a thirtieth.
+const SETTLED_FROM_POSE_PX: f64 = 0.02;
 /// The same for a first fit that only serves to find the pose.
 const ROUGHLY_SETTLED_PX: f64 = 0.05;
 /// Bounds of the fitted blur, px.
@@ -189,10 +189,10 @@ pub(super) fn fit(
         PointKind::Saddle => rules.saddle_window_px + 1.0,
     };
     let border = rules.image_border_px;
-    let settled_px = if rough {
-        ROUGHLY_SETTLED_PX
-    } else {
-        SETTLED_PX
+    let settled_px = match (rough, free_blur) {
+        (true, _) => ROUGHLY_SETTLED_PX,
+        (false, true) => SETTLED_PX,
+        (false, false) => SETTLED_FROM_POSE_PX,
     };
     let (mut centre, mut blur) = (start.pixel_px, blur_px);
     let mut last = None;
@@ -467,8 +467,13 @@ impl Window {
                     let weight = self.weights(&d.edge_px, &du, dv, (last - u) as f32);
                     let grey = greys(&image.pixels, v * width + u);
                     let on = each(|k| if weight[k] > 0.0 { 1.0 } else { 0.0 });
-                    let clipped =
-                        each(|k| if grey[k] >= self.saturation_dn { 1.0 } else { 0.0 });
+                    let clipped = each(|k| {
+                        if grey[k] >= self.saturation_dn {
+                            1.0
+                        } else {
+                            0.0
+                        }
+                    });
                     counted = each(|k| counted[k] + on[k]);
                     saturated = each(|k| saturated[k] + on[k] * clipped[k]);
                     let a = [

@@ -221,9 +221,8 @@ struct Frame {
 impl Picture {
     /// Offsets (px) of the grid's column `i` and row `j` from a pixel.
     fn offset(&self, from_px: &Vector2<f64>, i: usize, j: usize) -> (f32, f32) {
-        let at = |k: usize, n: usize| {
-            (self.origin_px[k] + n as f64 * self.step_px - from_px[k]) as f32
-        };
+        let at =
+            |k: usize, n: usize| (self.origin_px[k] + n as f64 * self.step_px - from_px[k]) as f32;
         (at(0, i), at(1, j))
     }
 

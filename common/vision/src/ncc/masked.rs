@@ -72,7 +72,8 @@ unsafe fn sums_sse2(image: &SearchImage, template: &Template, start: usize) -> [
         for row in 0..template.height {
             let (line, at) = (start + row * image.stride, row * template.stride);
             for k in (0..template.stride).step_by(8) {
-                let load = |p: *const i16, i: usize| _mm_loadu_si128(p.add(i + k).cast::<__m128i>());
+                let load =
+                    |p: *const i16, i: usize| _mm_loadu_si128(p.add(i + k).cast::<__m128i>());
                 let pixels = load(image.values.as_ptr(), line);
                 let mask = load(template.mask.as_ptr(), at);
                 let inside = _mm_mullo_epi16(pixels, mask);
