@@ -85,6 +85,11 @@ pub enum LayoutError {
 /// Marks closer than this fraction of a disc radius count as the same place in the symmetry check.
 const SAME_PLACE: f64 = 0.5;
 
+/// Length of a vector on the plate, m.
+fn length(x_m: f64, y_m: f64) -> f64 {
+    (x_m * x_m + y_m * y_m).sqrt()
+}
+
 impl PlateLayout {
     /// A square plate of the given width: 11 discs on a ring along the border (4 per side; one of
     /// the 12 places is empty, so that no rotation maps the layout onto itself) and a checker in
@@ -264,13 +269,13 @@ impl PlateLayout {
         for (i, d) in self.discs.iter().enumerate() {
             apart(i, None, to_edge(d.x_m, d.y_m, d.radius_m))?;
             for (j, other) in self.discs.iter().enumerate().skip(i + 1) {
-                let distance = (d.x_m - other.x_m).hypot(d.y_m - other.y_m);
+                let distance = length(d.x_m - other.x_m, d.y_m - other.y_m);
                 apart(i, Some(j), distance - d.radius_m - other.radius_m)?;
             }
             if let Some(s) = &self.saddle {
                 let dx = ((d.x_m - s.x_m).abs() - s.half_size_m).max(0.0);
                 let dy = ((d.y_m - s.y_m).abs() - s.half_size_m).max(0.0);
-                apart(i, Some(last), dx.hypot(dy) - d.radius_m)?;
+                apart(i, Some(last), length(dx, dy) - d.radius_m)?;
             }
         }
         if let Some(s) = &self.saddle {
@@ -293,7 +298,7 @@ impl PlateLayout {
                 let (x, y) = turned(d.x_m, d.y_m);
                 self.discs
                     .iter()
-                    .any(|e| (x - e.x_m).hypot(y - e.y_m) < SAME_PLACE * e.radius_m)
+                    .any(|e| length(x - e.x_m, y - e.y_m) < SAME_PLACE * e.radius_m)
             });
             if same {
                 return Err(LayoutError::Symmetric {

@@ -55,7 +55,8 @@ impl Solver<'_> {
                         }
                     },
                 };
-                let plane = match self.plane(&side, &hand, self.plane_margin(&side, &hand)) {
+                let margin = self.plane_margin(&side, &hand);
+                let plane = match self.plane(&side, &hand, margin, margin) {
                     Ok(plane) => plane,
                     Err(edge) => {
                         fails(edge);

@@ -49,6 +49,8 @@ pub(super) struct Side {
     /// `w.r` and `w.z`.
     pub forward: f64,
     pub height: f64,
+    /// `1 / forward`.
+    pub over_forward: f64,
     /// How uncertain `forward` is before polishing, metres.
     pub blur: f64,
     /// Whether it was moved off the edge of reach.
@@ -61,6 +63,8 @@ pub(super) struct Hand {
     pub psi: f64,
     pub sin_psi: f64,
     pub cos_psi: f64,
+    /// `1 / sin_psi`.
+    pub over_sin_psi: f64,
     pub phi: f64,
     /// `u` along `r` and `z`.
     pub u: (f64, f64),
@@ -72,6 +76,8 @@ pub(super) struct Plane {
     /// The wrist from the shoulder, along `r` and `z`.
     pub x: f64,
     pub z: f64,
+    /// One over the square of its distance; 0 where that is next to nothing.
+    pub over_square: f64,
     /// Direction of the wrist, and angle between it and the upper arm.
     pub direction: f64,
     pub interior: f64,
@@ -172,6 +178,7 @@ impl<'a> Solver<'a> {
                 c1,
                 forward: 0.0,
                 height: w.z,
+                over_forward: f64::INFINITY,
                 blur: 0.0,
                 is_moved: false,
             });
@@ -187,6 +194,7 @@ impl<'a> Solver<'a> {
             c1,
             forward,
             height: w.z,
+            over_forward: 1.0 / forward,
             blur,
             is_moved: slack < slack_min,
         })
@@ -199,12 +207,14 @@ impl<'a> Solver<'a> {
         // A little more than nothing, so that the division below is defined.
         let sine = (along_r * along_r + a.z * a.z).sqrt().max(1e-300);
         let cosine = self.family.roll * along_m;
+        let over = 1.0 / sine;
         Hand {
             psi: atan2(sine, cosine),
             sin_psi: sine,
             cos_psi: cosine,
+            over_sin_psi: over,
             phi: atan2(a.z, along_r),
-            u: (along_r / sine, a.z / sine),
+            u: (along_r * over, a.z * over),
         }
     }
 
@@ -220,6 +230,7 @@ impl<'a> Solver<'a> {
         let ([s, _], [c, _]) = sin_cos(&[phi, 0.0], 1);
         Ok(Hand {
             sin_psi: 0.0,
+            over_sin_psi: f64::INFINITY,
             phi,
             u: (c, s),
             ..*hand
@@ -237,14 +248,20 @@ impl<'a> Solver<'a> {
     /// How far beyond the plane arm's edges a branch is still tried, metres: what the rows lack
     /// turns joint 0, and with it the plane angle, the more the nearer both are to singular.
     pub fn plane_margin(&self, side: &Side, hand: &Hand) -> f64 {
-        let turn = self.margin + side.blur / side.forward.abs().max(1e-3);
-        let plane_angle = (turn / hand.sin_psi.abs().max(1e-12)).min(2.0);
+        let turn = self.margin + side.blur * side.over_forward.abs().min(1e3);
+        let plane_angle = (turn * hand.over_sin_psi.abs().min(1e12)).min(2.0);
         self.margin + side.blur + self.normal.abs() * plane_angle
     }
 
-    /// The plane arm. `slack_min` as in [`Self::side`].
-    pub fn plane(&self, side: &Side, hand: &Hand, slack_min: f64) -> Result<Plane, Edge> {
-        let margin = self.plane_margin(side, hand);
+    /// The plane arm, tried up to `margin` beyond its edges (see [`Self::plane_margin`]);
+    /// `slack_min` as in [`Self::side`].
+    pub fn plane(
+        &self,
+        side: &Side,
+        hand: &Hand,
+        margin: f64,
+        slack_min: f64,
+    ) -> Result<Plane, Edge> {
         let f = self.family;
         let (x0, z0) = self.shoulder(side);
         let (x, z) = (x0 + self.normal * hand.u.1, z0 - self.normal * hand.u.0);
@@ -260,15 +277,15 @@ impl<'a> Solver<'a> {
         }
         let is_moved = beyond.min(within) < slack_min;
         let (beyond, within) = (beyond.max(slack_min), within.max(slack_min));
-        let twice = 2.0 * f.upper * f.fore;
-        let cosine = (square - f.upper * f.upper - f.fore * f.fore) / twice;
+        let cosine = (square - f.upper * f.upper - f.fore * f.fore) * f.over_twice;
         // Heron's form: exact near the straight and the folded arm.
         let heron = beyond * (longest + distance) * within * (distance + shortest);
-        let sine = heron.sqrt() / twice.abs();
+        let sine = heron.sqrt() * f.over_twice.abs();
         let interior = atan2(f.fore * sine, f.upper + f.fore * cosine);
         Ok(Plane {
             x,
             z,
+            over_square: if square > 1e-18 { 1.0 / square } else { 0.0 },
             direction: atan2(z, x),
             interior,
             bent: atan2(sine, cosine),
@@ -285,11 +302,10 @@ impl<'a> Solver<'a> {
         let seen = if elbow == Elbow::Positive { 1.0 } else { -1.0 };
         let sign = seen * (f.upper * f.fore).signum();
         let (phi2, phi3) = (plane.direction - sign * plane.interior, sign * plane.bent);
-        let square = x * x + z * z;
         let straight = f.upper + f.fore * plane.cosine;
         let across = f.fore * sign * plane.sine;
-        let upper = if square > 1e-18 {
-            let scale = f.upper / square;
+        let upper = if plane.over_square > 0.0 {
+            let scale = f.upper * plane.over_square;
             (
                 (x * straight + z * across) * scale,
                 (z * straight - x * across) * scale,
@@ -311,16 +327,16 @@ impl<'a> Solver<'a> {
             theta: [side.theta1, theta2, theta3, theta4, theta5],
             sine: [
                 side.s1,
-                bend * upper.1 / f.upper,
+                bend * upper.1 * f.over_upper,
                 bend * sign * plane.sine,
-                bend * (u.1 * fore.0 - u.0 * fore.1) / f.fore,
+                bend * (u.1 * fore.0 - u.0 * fore.1) * f.over_fore,
                 hand.sin_psi * ahead_cosine - hand.cos_psi * ahead_sine,
             ],
             cosine: [
                 side.c1,
-                upper.0 / f.upper,
+                upper.0 * f.over_upper,
                 plane.cosine,
-                (u.0 * fore.0 + u.1 * fore.1) / f.fore,
+                (u.0 * fore.0 + u.1 * fore.1) * f.over_fore,
                 hand.cos_psi * ahead_cosine + hand.sin_psi * ahead_sine,
             ],
             upper,
@@ -338,6 +354,7 @@ impl Hand {
             psi: -self.psi,
             sin_psi: -self.sin_psi,
             cos_psi: self.cos_psi,
+            over_sin_psi: -self.over_sin_psi,
             phi: self.phi + PI,
             u: (-self.u.0, -self.u.1),
         }

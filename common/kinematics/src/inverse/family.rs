@@ -52,6 +52,10 @@ pub(crate) struct Family {
     pub upper: f64,
     /// `a` of the third row.
     pub fore: f64,
+    /// `1 / upper`, `1 / fore` and `1 / (2 upper fore)`.
+    pub over_upper: f64,
+    pub over_fore: f64,
+    pub over_twice: f64,
     /// `d` of rows 1 to 3, along the bending axis `m = (s1, -c1, 0)`.
     pub sideways: f64,
     /// `d` of the last row.
@@ -139,6 +143,9 @@ impl Family {
             reach: rows[0].a_m,
             upper: rows[1].a_m,
             fore: rows[2].a_m,
+            over_upper: 1.0 / rows[1].a_m,
+            over_fore: 1.0 / rows[2].a_m,
+            over_twice: 1.0 / (2.0 * rows[1].a_m * rows[2].a_m),
             sideways: sign(0) * (rows[1].d_m + rows[2].d_m + rows[3].d_m),
             turret: rows[4].d_m,
             bend: sign(0),

@@ -22,7 +22,6 @@ const ACCEPTED: f64 = 1e-9;
 const SAFETY: f64 = 1e3;
 /// Largest change of a joint that still counts as a correction, radians.
 const SMALL_RAD: f64 = 1e-3;
-
 impl Solver<'_> {
     /// Tool point and axis by the given rows, for given sines and cosines.
     #[inline(always)]
@@ -71,21 +70,23 @@ impl Solver<'_> {
             if !is_correction {
                 break;
             }
-            for joint in 0..5 {
-                let d = change[joint];
-                let (s, c) = (sine[joint], cosine[joint]);
-                let square = d * d;
-                let turn = d - d * square * (1.0 / 6.0);
-                let versine = square * (0.5 - square * (1.0 / 24.0));
-                theta[joint] += d;
-                sine[joint] = s + (c * turn - s * versine);
-                cosine[joint] = c - (s * turn + c * versine);
+            for (angle, d) in theta.iter_mut().zip(&change) {
+                *angle += d;
             }
             // The derivative is kept, so the residual shrinks by about the same factor each time.
             if before.is_finite() && SAFETY * error * error <= POLISHED * before {
                 return Ok(theta);
             }
             before = error;
+            for joint in 0..5 {
+                let d = change[joint];
+                let (s, c) = (sine[joint], cosine[joint]);
+                let square = d * d;
+                let turn = d - d * square * (1.0 / 6.0);
+                let versine = square * (0.5 - square * (1.0 / 24.0));
+                sine[joint] = s + (c * turn - s * versine);
+                cosine[joint] = c - (s * turn + c * versine);
+            }
         }
         self.rescue(p, branch)
     }
@@ -97,11 +98,11 @@ impl Solver<'_> {
         let (side, hand) = (&p.side, &p.hand);
         let (u, c1, s1) = (hand.u, side.c1, side.s1);
         let dw = dp - da * self.turret.length;
-        let turn = -(dw.x * s1 - dw.y * c1) / side.forward;
+        let turn = -(dw.x * s1 - dw.y * c1) * side.over_forward;
         let axis_m = da.x * s1 - da.y * c1 + hand.sin_psi * u.0 * turn;
         let axis_r = da.x * c1 + da.y * s1 - f.roll * hand.cos_psi * turn;
         let psi = hand.cos_psi * (u.0 * axis_r + u.1 * da.z) - f.roll * hand.sin_psi * axis_m;
-        let phi = (u.0 * da.z - u.1 * axis_r) / hand.sin_psi;
+        let phi = (u.0 * da.z - u.1 * axis_r) * hand.over_sin_psi;
         let x = dw.x * c1 + dw.y * s1 - f.sideways * turn + self.normal * u.0 * phi;
         let z = dw.z + self.normal * u.1 * phi;
         let scale = 1.0 / p.area;
@@ -160,7 +161,8 @@ impl Solver<'_> {
             if !is_free && branch.wrist == Wrist::Negative {
                 hand = hand.flipped();
             }
-            let Ok(plane) = self.plane(&side, &hand, 0.0) else {
+            let margin = self.plane_margin(&side, &hand);
+            let Ok(plane) = self.plane(&side, &hand, margin, 0.0) else {
                 break;
             };
             theta = self.posture(&side, &hand, &plane, branch.elbow).theta;

@@ -1,295 +1,21 @@
-//! From the predicted pose to an aligned one: correlation of the warped appearance at reduced
-//! resolution, then a least-squares alignment of the whole plate.
+//! Least-squares alignment of the whole plate's appearance with the image.
 
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
+use super::PlateSearch;
+use super::lanes::{LANES, Lane, add_products, each, ramp, total};
+use super::locate::{Candidate, level_sigma};
 use super::model::{self, LocalMap, Part, Picture};
-use super::{NotFound, PlateSearch};
 use crate::image::Image8;
-use crate::ncc::{SearchImage, Template, score_map};
-
-/// A place where the plate may be: the map around the centre of the searched part, and the NCC of
-/// its appearance there.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Candidate {
-    pub map: LocalMap,
-    pub score: f64,
-}
-
-/// Least side of a part's image at the coarse level, px of that level.
-const MIN_COARSE_SIDE: f64 = 12.0;
-/// Least radius of a mark at the coarse level, px of that level.
-const MIN_COARSE_MARK: f64 = 0.9;
-/// Coarsest level: quarter resolution.
-const MAX_LEVEL: u32 = 2;
-/// Variance of the box that makes one pixel of unit side, px^2.
-const BOX_VARIANCE: f64 = 1.0 / 12.0;
-
-/// Smallest half size of the searched part's marks, m.
-fn smallest_mark_m(search: &PlateSearch, part: Part) -> f64 {
-    let discs = search.layout.discs.iter().map(|d| d.radius_m);
-    let saddle = search.layout.saddle.iter().map(|s| s.half_size_m);
-    match part {
-        Part::Plate => discs.chain(saddle).fold(f64::INFINITY, f64::min),
-        Part::Saddle => saddle.fold(f64::INFINITY, f64::min),
-    }
-}
-
-/// The part of the image to search, and at which resolution.
-struct Field<'a> {
-    search: &'a PlateSearch<'a>,
-    part: Part,
-    window: SearchImage,
-    /// First pixel of the window in the image.
-    corner: Vector2<f64>,
-    level: u32,
-    /// Shorter side of the part's image, px.
-    side: f64,
-}
-
-impl<'a> Field<'a> {
-    fn new(
-        image: &Image8,
-        search: &'a PlateSearch,
-        map: &LocalMap,
-        part: Part,
-    ) -> Result<Self, NotFound> {
-        let needed_px = search.rules.min_mark_radius_px;
-        let mark_px = smallest_mark_m(search, part) * map.scales().0;
-        if !(mark_px >= needed_px) {
-            return Err(NotFound::TooSmall {
-                found_px: mark_px,
-                needed_px,
-            });
-        }
-        let (low, high) = model::bounds(search.layout, part, map);
-        let side = (high.x - low.x).min(high.y - low.y);
-        let mut level = 0;
-        while level < MAX_LEVEL
-            && side / f64::from(2u32 << level) >= MIN_COARSE_SIDE
-            && mark_px / f64::from(2u32 << level) >= MIN_COARSE_MARK
-        {
-            level += 1;
-        }
-        // the widest hypothesis must fit
-        let step = f64::from(1u32 << level);
-        let room = search.search_radius_px + 0.15 * (high - low).max() + 2.0 * step;
-        let clamp = |x: f64, size: u32| x.clamp(0.0, f64::from(size)) as u32;
-        let left = clamp((low.x - room).floor(), image.width_px);
-        let top = clamp((low.y - room).floor(), image.height_px);
-        let right = clamp((high.x + room).ceil() + 1.0, image.width_px);
-        let bottom = clamp((high.y + room).ceil() + 1.0, image.height_px);
-        if right <= left || bottom <= top {
-            return Err(outside(search, map));
-        }
-        Ok(Self {
-            search,
-            part,
-            window: SearchImage::new(image, left, top, right - left, bottom - top, level),
-            corner: Vector2::new(f64::from(left), f64::from(top)),
-            level,
-            side,
-        })
-    }
-
-    /// Drops places close to better ones.
-    fn distinct(&self, mut places: Vec<Candidate>) -> Vec<Candidate> {
-        places.sort_by(|a, b| b.score.total_cmp(&a.score));
-        let mut kept: Vec<Candidate> = Vec::new();
-        for place in places {
-            let close = |c: &Candidate| {
-                (c.map.pixel_px - place.map.pixel_px).norm() < SAME_PLACE * self.side
-            };
-            if !kept.iter().any(close) {
-                kept.push(place);
-            }
-        }
-        kept
-    }
-}
-
-/// Places closer than this fraction of the part's side are one.
-const SAME_PLACE: f64 = 0.15;
-/// Places that are followed up before other rotations and sizes are tried.
-const FIRST_PLACES: usize = 2;
-
-fn outside(search: &PlateSearch, map: &LocalMap) -> NotFound {
-    NotFound::OutsideImage {
-        u_px: map.pixel_px.x,
-        v_px: map.pixel_px.y,
-        search_radius_px: search.search_radius_px,
-    }
-}
-
-/// Looks for the searched part and measures it with `measure`, which is given candidates in the
-/// order of their likeness until it accepts one.
-pub(super) fn locate<T>(
-    image: &Image8,
-    search: &PlateSearch,
-    map: &LocalMap,
-    part: Part,
-    measure: &dyn Fn(&Candidate) -> Result<T, NotFound>,
-) -> Result<T, NotFound> {
-    let rules = search.rules;
-    let field = Field::new(image, search, map, part)?;
-    let at_once = correlate(&field, map);
-    let mut placed = at_once.is_some();
-    let mut places = field.distinct(at_once.unwrap_or_default());
-    let enough = |c: &&Candidate| c.score >= rules.min_coarse_score;
-
-    for place in places.iter().filter(enough).take(FIRST_PLACES) {
-        // a single crossing needs no more than its place when it looks as predicted
-        if part == Part::Saddle
-            && place.score >= rules.min_saddle_score
-            && let Ok(found) = measure(place)
-        {
-            return Ok(found);
-        }
-        if let Some(aligned) = refine(image, search, place, part, field.level)
-            && aligned.score >= rules.good_coarse_score
-            && let Ok(found) = measure(&aligned)
-        {
-            return Ok(found);
-        }
-    }
-    for variant in variants(search, map) {
-        if let Some(more) = correlate(&field, &variant) {
-            placed = true;
-            places.extend(more);
-        }
-    }
-    if !placed {
-        return Err(outside(search, map));
-    }
-    places = field.distinct(places);
-    let score = places.first().map_or(0.0, |c| c.score);
-    let mut aligned: Vec<Candidate> = places
-        .iter()
-        .filter(enough)
-        .take(rules.max_candidates)
-        .filter_map(|place| refine(image, search, place, part, field.level))
-        .collect();
-    aligned.sort_by(|a, b| b.score.total_cmp(&a.score));
-    let mut failure = None;
-    for candidate in &aligned {
-        match measure(candidate) {
-            Ok(found) => return Ok(found),
-            Err(e) => {
-                failure.get_or_insert(e);
-            }
-        }
-    }
-    Err(failure.unwrap_or(NotFound::LowScore {
-        score,
-        limit: rules.min_coarse_score,
-    }))
-}
-
-/// The predicted map turned, scaled and foreshortened as the rules say.
-fn variants(search: &PlateSearch, map: &LocalMap) -> Vec<LocalMap> {
-    let rules = search.rules;
-    let mut all = Vec::new();
-    let mut push = |change: Matrix2<f64>| {
-        all.extend(LocalMap::from_parts(
-            map.centre_m,
-            map.pixel_px,
-            change * map.m,
-            map.g,
-        ));
-    };
-    let turn = |degrees: f64| nalgebra::Rotation2::new(degrees.to_radians()).into_inner();
-    for &angle in &rules.rotations_deg {
-        push(turn(angle));
-    }
-    let angles: Vec<f64> = std::iter::once(0.0)
-        .chain(rules.rotations_deg.iter().copied())
-        .collect();
-    for &scale in &rules.scales {
-        for &angle in &angles {
-            push(turn(angle) * scale);
-        }
-    }
-    // squeeze along the direction in which the plate is already foreshortened
-    let svd = map.m.svd(true, false);
-    if let Some(u) = svd.u {
-        let shortest = usize::from(svd.singular_values[1] < svd.singular_values[0]);
-        let axis: Vector2<f64> = u.column(shortest).into_owned();
-        for &factor in &rules.foreshortenings {
-            push(Matrix2::identity() + (factor - 1.0) * axis * axis.transpose());
-        }
-    }
-    all
-}
-
-/// Correlates one appearance over the window. `None` if it does not fit in.
-fn correlate(field: &Field, map: &LocalMap) -> Option<Vec<Candidate>> {
-    let Field {
-        search,
-        part,
-        window,
-        corner,
-        level,
-        ..
-    } = field;
-    let (part, level) = (*part, *level);
-    let step = f64::from(1u32 << level);
-    let (low, high) = model::bounds(search.layout, part, map);
-    let size = |a: f64, b: f64| ((b - a) / step).ceil() as usize + 1;
-    let (width, height) = (size(low.x, high.x), size(low.y, high.y));
-    if width > window.width() || height > window.height() {
-        return None;
-    }
-    // image position of the template's first pixel when drawn
-    let origin = low;
-    let picture = model::draw(
-        search.layout,
-        part,
-        map,
-        level_sigma(search.rules.blur_sigma_px, level),
-        origin,
-        step,
-        (width, height),
-    )?;
-    let values: Vec<f32> = picture.values.iter().map(|x| -x).collect();
-    let template = Template::new(width, height, &values, Some(&picture.mask)).ok()?;
-    // position i of the window has its first pixel's centre at corner + i step + (step - 1) / 2
-    let offset = (origin - corner) / step - Vector2::repeat((step - 1.0) / (2.0 * step));
-    let radius = search.search_radius_px / step;
-    let range = |x: f64| {
-        let first = (x - radius).floor().max(0.0);
-        let last = (x + radius).ceil();
-        (first as usize, (last - first + 1.0).max(0.0) as usize)
-    };
-    let ((x, columns), (y, rows)) = (range(offset.x), range(offset.y));
-    let scores = score_map(window, &template, x, y, columns, rows)?;
-    let list = scores
-        .peaks(search.rules.max_candidates)
-        .into_iter()
-        .filter_map(|(i, j, score)| {
-            let (du, dv) = scores.refine(i, j);
-            let found = Vector2::new((scores.left + i) as f64 + du, (scores.top + j) as f64 + dv);
-            let pixel_px = map.pixel_px + (found - offset) * step;
-            LocalMap::from_parts(map.centre_m, pixel_px, map.m, map.g).map(|map| Candidate {
-                map,
-                score: f64::from(score),
-            })
-        });
-    Some(list.collect())
-}
-
-/// Blur of an image reduced `level` times, in full-resolution px.
-fn level_sigma(sigma_px: f64, level: u32) -> f64 {
-    let step = f64::from(1u32 << level);
-    // the full-resolution blur already holds one pixel's box
-    (sigma_px * sigma_px + (step * step - 1.0) * BOX_VARIANCE).sqrt()
-}
+use crate::ncc::SearchImage;
 
 const MAX_STEPS: usize = 8;
-/// Alignment stops when a step moves the part's corners by less, px of the level.
-const SETTLED_PX: f64 = 0.02;
+/// Alignment stops when a step moves the part's corners by less, px of the level; the fits of the
+/// marks do the rest.
+const SETTLED_PX: f64 = 0.05;
 
 /// Aligns position, rotation, size and shear level by level; `None` if it runs away.
-fn refine(
+pub(super) fn refine(
     image: &Image8,
     search: &PlateSearch,
     start: &Candidate,
@@ -348,6 +74,7 @@ fn align_step(
         origin,
         step,
         (width, height),
+        true,
     )?;
     let seen = SearchImage::new(
         image,
@@ -380,53 +107,25 @@ const NORMALISE_PX: f64 = 32.0;
 /// Least squares of image = gain * darkness(moved) + offset for the motion (du, dv, and the 2 x 2
 /// change per [`NORMALISE_PX`]); also the NCC of image and picture as they are.
 fn solve(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Option<([f64; 6], f64)> {
+    let sums = accumulate(picture, seen, map);
     let mut normal = SMatrix::<f64, 8, 8>::zeros();
     let mut right = SVector::<f64, 8>::zeros();
-    let (mut n, mut si, mut sii) = (0.0f64, 0.0f64, 0.0f64);
-    for j in 0..picture.height {
-        let mut rows = [0.0f32; 45];
-        let v = ((picture.origin_px.y + j as f64 * picture.step_px - map.pixel_px.y) / NORMALISE_PX)
-            as f32;
-        let line = seen.values(j);
-        for (i, &grey) in line.iter().enumerate().take(picture.width) {
-            let k = j * picture.width + i;
-            if !picture.mask[k] {
-                continue;
-            }
-            let u = ((picture.origin_px.x + i as f64 * picture.step_px - map.pixel_px.x)
-                / NORMALISE_PX) as f32;
-            let (gu, gv) = (-picture.du[k], -picture.dv[k]);
-            let t = picture.values[k];
-            let y = SearchImage::grey(grey);
-            let a = [gu, gv, gu * u, gu * v, gv * u, gv * v, t, 1.0, y];
-            let mut at = 0;
-            for (p, &ap) in a.iter().enumerate() {
-                for &aq in &a[p..] {
-                    rows[at] += ap * aq;
-                    at += 1;
+    let mut sii = 0.0;
+    let mut at = 0;
+    for p in 0..9 {
+        for q in 0..=p {
+            match (p < 8, q < 8) {
+                (true, true) => {
+                    normal[(p, q)] = sums[at];
+                    normal[(q, p)] = sums[at];
                 }
+                (false, true) => right[q] = sums[at],
+                _ => sii = sums[at],
             }
-        }
-        let mut at = 0;
-        for p in 0..9 {
-            for q in p..9 {
-                let x = f64::from(rows[at]);
-                at += 1;
-                match (p < 8, q < 8) {
-                    (true, true) => normal[(p, q)] += x,
-                    (true, false) => right[p] += x,
-                    _ => sii += x,
-                }
-            }
+            at += 1;
         }
     }
-    n += normal[(7, 7)];
-    si += right[7];
-    for p in 0..8 {
-        for q in 0..p {
-            normal[(p, q)] = normal[(q, p)];
-        }
-    }
+    let (n, si) = (normal[(7, 7)], right[7]);
     if n < 20.0 {
         return None;
     }
@@ -459,4 +158,95 @@ fn solve(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Option<([f64;
         .iter()
         .all(|x| x.is_finite())
         .then_some((parameters, ncc))
+}
+
+/// Lower triangle of the normal equations of [`solve`], row by row: six motions, darkness, one,
+/// grey value.
+type Sums = [f64; 45];
+
+/// Rows whose sums are held in single precision.
+const ROWS_AT_ONCE: usize = 4;
+
+fn accumulate(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Sums {
+    #[cfg(target_arch = "x86_64")]
+    if std::arch::is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has AVX2.
+        return unsafe { accumulate_avx2(picture, seen, map) };
+    }
+    accumulate_plain(picture, seen, map)
+}
+
+/// The same with wider vectors.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn accumulate_avx2(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Sums {
+    accumulate_plain(picture, seen, map)
+}
+
+#[inline(always)]
+fn accumulate_plain(picture: &Picture, seen: &SearchImage, map: &LocalMap) -> Sums {
+    let mut sums = [0.0f64; 45];
+    let place = |k: usize, n: usize| {
+        let at_px = picture.origin_px[k] + n as f64 * picture.step_px - map.pixel_px[k];
+        (at_px / NORMALISE_PX) as f32
+    };
+    let step = (picture.step_px / NORMALISE_PX) as f32;
+    for first_row in (0..picture.height).step_by(ROWS_AT_ONCE) {
+        let mut rows = [[0.0f32; LANES]; 45];
+        for j in first_row..picture.height.min(first_row + ROWS_AT_ONCE) {
+            let v = place(1, j);
+            let line = seen.values(j);
+            let width = picture.width.min(line.len());
+            for i in (0..width).step_by(LANES) {
+                let cells = j * picture.width + i..j * picture.width + (i + LANES).min(width);
+                let on = lane(&picture.mask[cells.clone()], |m| f32::from(u8::from(m)));
+                if on.iter().all(|&on| on == 0.0) {
+                    continue;
+                }
+                let values = lane(&picture.values[cells.clone()], |x| x);
+                let du = lane(&picture.du[cells.clone()], |x| x);
+                let dv = lane(&picture.dv[cells.clone()], |x| x);
+                let grey = lane(&line[i..i + cells.len()], SearchImage::grey);
+                let u = ramp(place(0, i), step);
+                let (gu, gv) = (each(|k| -du[k] * on[k]), each(|k| -dv[k] * on[k]));
+                let a = [
+                    gu,
+                    gv,
+                    each(|k| gu[k] * u[k]),
+                    each(|k| gu[k] * v),
+                    each(|k| gv[k] * u[k]),
+                    each(|k| gv[k] * v),
+                    each(|k| values[k] * on[k]),
+                    on,
+                    each(|k| grey[k] * on[k]),
+                ];
+                add_products::<0>(&mut rows, &a, &a[0]);
+                add_products::<1>(&mut rows, &a, &a[1]);
+                add_products::<2>(&mut rows, &a, &a[2]);
+                add_products::<3>(&mut rows, &a, &a[3]);
+                add_products::<4>(&mut rows, &a, &a[4]);
+                add_products::<5>(&mut rows, &a, &a[5]);
+                add_products::<6>(&mut rows, &a, &a[6]);
+                add_products::<7>(&mut rows, &a, &a[7]);
+                add_products::<8>(&mut rows, &a, &a[8]);
+            }
+        }
+        for (s, r) in sums.iter_mut().zip(&rows) {
+            *s += f64::from(total(r));
+        }
+    }
+    sums
+}
+
+/// Up to [`LANES`] values, zeros after them.
+#[inline(always)]
+fn lane<T: Copy>(values: &[T], f: impl Fn(T) -> f32) -> Lane {
+    let mut out = [0.0; LANES];
+    if let Some(whole) = values.first_chunk::<LANES>() {
+        return each(|k| f(whole[k]));
+    }
+    for (o, &x) in out.iter_mut().zip(values) {
+        *o = f(x);
+    }
+    out
 }

@@ -7,7 +7,8 @@
 
 use nalgebra::{SMatrix, SVector, Vector2};
 
-use super::model::{LocalMap, MarkModel};
+use super::lanes::{LANES, Lane, MarkModel, add_products, each, larger, ramp, smaller, total};
+use super::model::LocalMap;
 use super::{DetectionRules, PointKind};
 use crate::image::Image8;
 use crate::plate::PlateLayout;
@@ -95,6 +96,8 @@ pub(super) struct MarkFit {
 const MAX_STEPS: usize = 10;
 /// A fit has settled when its last step was shorter than this, px; what remains is far smaller.
 const SETTLED_PX: f64 = 0.005;
+/// The same with a known blur and the place from the pose of all marks: what remains is a thirtieth.
+const SETTLED_FROM_POSE_PX: f64 = 0.02;
 /// The same for a first fit that only serves to find the pose.
 const ROUGHLY_SETTLED_PX: f64 = 0.05;
 /// Bounds of the fitted blur, px.
@@ -186,10 +189,10 @@ pub(super) fn fit(
         PointKind::Saddle => rules.saddle_window_px + 1.0,
     };
     let border = rules.image_border_px;
-    let settled_px = if rough {
-        ROUGHLY_SETTLED_PX
-    } else {
-        SETTLED_PX
+    let settled_px = match (rough, free_blur) {
+        (true, _) => ROUGHLY_SETTLED_PX,
+        (false, true) => SETTLED_PX,
+        (false, false) => SETTLED_FROM_POSE_PX,
     };
     let (mut centre, mut blur) = (start.pixel_px, blur_px);
     let mut last = None;
@@ -286,66 +289,34 @@ fn gauss_newton_step(
     reach_px: f64,
     rules: &DetectionRules,
 ) -> Option<Step> {
-    let model = mark.model(map, blur_px)?;
-    let edge = EdgeDistance::new(mark, map);
-    let width = image.width_px as usize;
-    let (u0, u1) = (
-        (centre.x - reach_px).ceil() as usize,
-        (centre.x + reach_px) as usize,
-    );
-    let (v0, v1) = (
-        (centre.y - reach_px).ceil() as usize,
-        (centre.y + reach_px) as usize,
-    );
-    let margin = margin_px as f32 + 0.5;
-    let rim = (CHECKER_RIM * blur_px) as f32;
-    let window = rules.saddle_window_px as f32 + 0.5;
-    let (mut saturated, mut counted) = (0u32, 0u32);
-    let mut sums = [0.0f64; 21];
-    for v in v0..=v1 {
-        let dv = (v as f64 - centre.y) as f32;
-        let mut row = [0.0f32; 21];
-        let line = &image.pixels[v * width + u0..=v * width + u1];
-        for (i, &pixel) in line.iter().enumerate() {
-            let du = ((u0 + i) as f64 - centre.x) as f32;
-            let d = model.at(du, dv);
-            let weight = match mark.kind {
-                PointKind::Disc => margin - d.edge_px,
-                PointKind::Saddle => (-d.edge_px - rim).min(window - (du * du + dv * dv).sqrt()),
-            };
-            let weight = weight.min(edge.at(du, dv)).clamp(0.0, 1.0);
-            if weight <= 0.0 {
-                continue;
-            }
-            counted += 1;
-            saturated += u32::from(pixel >= rules.saturation_dn);
-            let a = [-d.du, -d.dv, d.value, 1.0, d.dsigma, f32::from(pixel)];
-            let mut at = 0;
-            for p in 0..6 {
-                let wp = weight * a[p];
-                for aq in &a[p..] {
-                    row[at] += wp * aq;
-                    at += 1;
-                }
-            }
-        }
-        for (s, r) in sums.iter_mut().zip(row) {
-            *s += f64::from(r);
-        }
-    }
+    let window = Window {
+        model: mark.model(map, blur_px)?,
+        edge: EdgeDistance::new(mark, map),
+        kind: mark.kind,
+        centre,
+        reach_px,
+        margin_px: margin_px as f32 + 0.5,
+        rim_px: (CHECKER_RIM * blur_px) as f32,
+        radius_px: rules.saddle_window_px as f32 + 0.5,
+        saturation_dn: f32::from(rules.saturation_dn) - MIDDLE_DN,
+    };
+    let (sums, saturated) = window.accumulate(image, free_blur);
     let mut normal = SMatrix::<f64, 5, 5>::zeros();
     let mut right = SVector::<f64, 5>::zeros();
     let mut square = 0.0;
     let mut at = 0;
     for p in 0..6 {
-        for q in p..6 {
-            match (p < 5, q < 5) {
-                (true, true) => {
-                    normal[(p, q)] = sums[at];
-                    normal[(q, p)] = sums[at];
+        for q in 0..=p {
+            // the blur is the last of the unknowns
+            let unknown = |k: usize| if k == 5 { 4 } else { k };
+            match (p == GREY, q == GREY) {
+                (false, false) => {
+                    normal[(unknown(p), unknown(q))] = sums[at];
+                    normal[(unknown(q), unknown(p))] = sums[at];
                 }
-                (true, false) => right[p] = sums[at],
-                _ => square = sums[at],
+                (true, true) => square = sums[at],
+                (true, false) => right[unknown(q)] = sums[at],
+                (false, true) => right[unknown(p)] = sums[at],
             }
             at += 1;
         }
@@ -379,20 +350,186 @@ fn gauss_newton_step(
     }
     let freedom = (weight - 5.0).max(1.0);
     let rms_dn = ((square - x.dot(&right)).max(0.0) / freedom).sqrt();
-    let covariance = factor.inverse();
-    let mean_variance = 0.5 * (covariance[(0, 0)] + covariance[(1, 1)]);
     // quantisation alone is 0.29 DN
-    let sigma_px = rms_dn.max(0.29) * mean_variance.sqrt() / gain.abs();
+    let sigma_px = rms_dn.max(0.29) * mean_variance(&factor.l()).sqrt() / gain.abs();
     Some(Step {
         shift: Vector2::new(x[0], x[1]) / gain,
         blur_shift: if free_blur { x[4] / gain } else { 0.0 },
         contrast_dn: -gain,
-        white_dn: x[3],
+        white_dn: x[3] + f64::from(MIDDLE_DN),
         rms_dn,
         sigma_px,
-        saturated: f64::from(saturated) / f64::from(counted.max(1)),
+        saturated,
         weight,
     })
+}
+
+/// Mean of the first two diagonal elements of (L L^T)^-1.
+fn mean_variance(l: &SMatrix<f64, 5, 5>) -> f64 {
+    let variance = |first: usize| {
+        // the column of L^-1, whose square is the element
+        let mut column = [0.0; 5];
+        let mut sum = 0.0;
+        for i in first..5 {
+            let mut x = f64::from(u8::from(i == first));
+            for j in first..i {
+                x -= l[(i, j)] * column[j];
+            }
+            column[i] = x / l[(i, i)];
+            sum += column[i] * column[i];
+        }
+        sum
+    };
+    0.5 * (variance(0) + variance(1))
+}
+
+/// The pixels around a mark's centre and what they are compared with.
+struct Window {
+    model: MarkModel,
+    edge: EdgeDistance,
+    kind: PointKind,
+    centre: Vector2<f64>,
+    reach_px: f64,
+    /// White beyond a disc's edge, px.
+    margin_px: f32,
+    /// Strip along the checker's border that is left out, px.
+    rim_px: f32,
+    /// Radius of the checker's window, px.
+    radius_px: f32,
+    /// See [`DetectionRules::saturation_dn`], less [`MIDDLE_DN`].
+    saturation_dn: f32,
+}
+
+/// Subtracted from the grey values, to keep the sums of their squares small, DN.
+const MIDDLE_DN: f32 = 128.0;
+
+/// Lower triangle of the normal equations, row by row: du, dv, darkness, one, grey value, blur.
+type Sums = [f64; 21];
+/// Place of the grey value among them.
+const GREY: usize = 4;
+
+/// Rows whose sums are held in single precision.
+const ROWS_AT_ONCE: usize = 4;
+
+impl Window {
+    /// The sums over the window, those with the blur only if it is free, and the fraction of the
+    /// pixels that are saturated.
+    fn accumulate(&self, image: &Image8, free_blur: bool) -> (Sums, f64) {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            return unsafe {
+                if free_blur {
+                    self.accumulate_avx2::<true>(image)
+                } else {
+                    self.accumulate_avx2::<false>(image)
+                }
+            };
+        }
+        if free_blur {
+            self.accumulate_plain::<true>(image)
+        } else {
+            self.accumulate_plain::<false>(image)
+        }
+    }
+
+    /// The same with wider vectors.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn accumulate_avx2<const BLUR: bool>(&self, image: &Image8) -> (Sums, f64) {
+        self.accumulate_plain::<BLUR>(image)
+    }
+
+    #[inline(always)]
+    fn accumulate_plain<const BLUR: bool>(&self, image: &Image8) -> (Sums, f64) {
+        let width = image.width_px as usize;
+        let (centre, reach) = (self.centre, self.reach_px);
+        let (top, bottom) = (
+            (centre.y - reach).ceil() as usize,
+            (centre.y + reach) as usize,
+        );
+        let (mut saturated, mut counted) = ([0.0f32; LANES], [0.0f32; LANES]);
+        let mut sums = [0.0f64; 21];
+        for first_row in (top..=bottom).step_by(ROWS_AT_ONCE) {
+            let mut rows = [[0.0f32; LANES]; 21];
+            for v in first_row..=bottom.min(first_row + ROWS_AT_ONCE - 1) {
+                let offset = v as f64 - centre.y;
+                // no pixel further away than the reach counts
+                let half = (reach * reach - offset * offset).max(0.0).sqrt();
+                let (first, last) = (
+                    (centre.x - half).ceil() as usize,
+                    (centre.x + half) as usize,
+                );
+                let dv = offset as f32;
+                for u in (first..=last).step_by(LANES) {
+                    let du = ramp((u as f64 - centre.x) as f32, 1.0);
+                    let d = self.model.at(&du, dv);
+                    let weight = self.weights(&d.edge_px, &du, dv, (last - u) as f32);
+                    let grey = greys(&image.pixels, v * width + u);
+                    let on = each(|k| if weight[k] > 0.0 { 1.0 } else { 0.0 });
+                    let clipped = each(|k| {
+                        if grey[k] >= self.saturation_dn {
+                            1.0
+                        } else {
+                            0.0
+                        }
+                    });
+                    counted = each(|k| counted[k] + on[k]);
+                    saturated = each(|k| saturated[k] + on[k] * clipped[k]);
+                    let a = [
+                        each(|k| -d.du[k]),
+                        each(|k| -d.dv[k]),
+                        d.value,
+                        [1.0; LANES],
+                        grey,
+                        d.dsigma,
+                    ];
+                    let weighted = |p: usize| each(|k| weight[k] * a[p][k]);
+                    add_products::<0>(&mut rows, &a, &weighted(0));
+                    add_products::<1>(&mut rows, &a, &weighted(1));
+                    add_products::<2>(&mut rows, &a, &weighted(2));
+                    add_products::<3>(&mut rows, &a, &weight);
+                    add_products::<4>(&mut rows, &a, &weighted(4));
+                    if BLUR {
+                        add_products::<5>(&mut rows, &a, &weighted(5));
+                    }
+                }
+            }
+            for (s, r) in sums.iter_mut().zip(&rows) {
+                *s += f64::from(total(r));
+            }
+        }
+        let fraction = f64::from(total(&saturated)) / f64::from(total(&counted)).max(1.0);
+        (sums, fraction)
+    }
+
+    /// What pixels count for, 0 to 1; 0 from the lane after `last` on.
+    #[inline(always)]
+    fn weights(&self, edge_px: &Lane, du: &Lane, dv: f32, last: f32) -> Lane {
+        let lane = ramp(0.0, 1.0);
+        let own = match self.kind {
+            PointKind::Disc => each(|k| self.margin_px - edge_px[k]),
+            PointKind::Saddle => each(|k| {
+                let inside = self.radius_px - (du[k] * du[k] + dv * dv).sqrt();
+                smaller(-edge_px[k] - self.rim_px, inside)
+            }),
+        };
+        let border = self.edge.at(du, dv);
+        each(|k| {
+            let weight = smaller(larger(smaller(own[k], border[k]), 0.0), 1.0);
+            if lane[k] <= last { weight } else { 0.0 }
+        })
+    }
+}
+
+/// Grey values less [`MIDDLE_DN`] from `start` on; the last one again beyond the end.
+#[inline(always)]
+fn greys(pixels: &[u8], start: usize) -> Lane {
+    let bytes = match pixels[start..].first_chunk::<LANES>() {
+        Some(bytes) => *bytes,
+        None => std::array::from_fn(|k| pixels[(start + k).min(pixels.len() - 1)]),
+    };
+    each(|k| f32::from(bytes[k]) - MIDDLE_DN)
 }
 
 /// Distance (px, less the blurred strip) of a pixel from the plate's border, to first order.
@@ -423,12 +560,12 @@ impl EdgeDistance {
         }
     }
 
-    #[inline]
-    fn at(&self, du: f32, dv: f32) -> f32 {
-        let axis = |k: usize| {
-            let x = self.at[k] + self.along[k][0] * du + self.along[k][1] * dv;
-            self.half[k] - x.abs()
+    #[inline(always)]
+    fn at(&self, du: &Lane, dv: f32) -> Lane {
+        let axis = |i: usize, k: usize| {
+            let x = self.at[i] + self.along[i][0] * du[k] + self.along[i][1] * dv;
+            self.half[i] - x.abs()
         };
-        axis(0).min(axis(1)) - EDGE_STRIP_PX as f32
+        each(|k| smaller(axis(0, k), axis(1, k)) - EDGE_STRIP_PX as f32)
     }
 }

@@ -7,6 +7,8 @@
 //! no correction afterwards and a shadow, a reflection or an occlusion spoils single points only.
 
 mod align;
+mod lanes;
+mod locate;
 mod mark;
 mod model;
 mod points;
@@ -19,8 +21,8 @@ use rover_cameras::Camera;
 use crate::image::Image8;
 use crate::plate::PlateLayout;
 
+pub(crate) use lanes::normal_at;
 pub use mark::PointFault;
-pub(crate) use model::normal_at;
 pub use pose::{PlatePose, estimate_plate_pose, estimate_plate_pose_single};
 pub(crate) use pose::{Sighting, solve_pose};
 pub use rules::DetectionRules;
@@ -177,7 +179,7 @@ fn prepare(image: &Image8, search: &PlateSearch) -> Result<model::LocalMap, NotF
 /// [`NotFound::LowScore`] or [`NotFound::TooFewPoints`].
 pub fn find_plate(image: &Image8, search: &PlateSearch) -> Result<PlateObservation, NotFound> {
     let map = prepare(image, search)?;
-    align::locate(image, search, &map, model::Part::Plate, &|candidate| {
+    locate::locate(image, search, &map, model::Part::Plate, &|candidate| {
         points::measure(image, search, candidate)
     })
 }
@@ -192,7 +194,7 @@ pub fn find_saddle(image: &Image8, search: &PlateSearch) -> Result<PointObservat
     let centre = Vector3::new(saddle.x_m, saddle.y_m, 0.0);
     let pose = &search.predicted_camera_frame_from_plate;
     let map = model::LocalMap::new(search.camera, pose, &centre)?;
-    align::locate(image, search, &map, model::Part::Saddle, &|candidate| {
+    locate::locate(image, search, &map, model::Part::Saddle, &|candidate| {
         points::measure_saddle(image, search, candidate)
     })
 }

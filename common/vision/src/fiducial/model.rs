@@ -1,13 +1,14 @@
 //! What the plate looks like around a point: the map from plate to pixels and the blurred image of
 //! discs and saddle, with derivatives.
 
-use std::sync::OnceLock;
+use std::ops::Range;
 
 use nalgebra::{Isometry3, Matrix2, Matrix3x2, Vector2, Vector3};
 use rover_cameras::Camera;
 
 use super::NotFound;
-use crate::plate::{Disc, PlateLayout, Saddle};
+use super::lanes::{Inverse, LANES, Lane, MarkModel, each, ramp, smaller};
+use crate::plate::PlateLayout;
 
 /// Least cosine between the plate's normal and the direction to the camera: 80 degrees.
 const MIN_FACING: f64 = 0.17;
@@ -99,208 +100,6 @@ impl LocalMap {
     }
 }
 
-/// Standard normal distribution function and density from a table: error below 3e-6.
-#[derive(Debug)]
-struct Normal {
-    table: Vec<(f32, f32)>,
-}
-
-const NORMAL_REACH: f32 = 5.0;
-const NORMAL_STEPS: f32 = 128.0;
-
-fn normal() -> &'static Normal {
-    static TABLE: OnceLock<Normal> = OnceLock::new();
-    TABLE.get_or_init(|| {
-        // Integrate the density by Simpson's rule from the middle outwards.
-        let density = |x: f64| (-0.5 * x * x).exp() / (2.0 * std::f64::consts::PI).sqrt();
-        let half = (NORMAL_REACH * NORMAL_STEPS) as usize;
-        let h = 1.0 / f64::from(NORMAL_STEPS);
-        let mut above = vec![0.5f64];
-        for i in 0..half + 1 {
-            let x = i as f64 * h;
-            let area = h / 6.0 * (density(x) + 4.0 * density(x + h / 2.0) + density(x + h));
-            above.push(above[i] + area);
-        }
-        let table = (0..=2 * half + 1)
-            .map(|i| {
-                let k = i as isize - half as isize;
-                let p = if k >= 0 {
-                    above[k as usize]
-                } else {
-                    1.0 - above[(-k) as usize]
-                };
-                (p as f32, density(k as f64 * h) as f32)
-            })
-            .collect();
-        Normal { table }
-    })
-}
-
-impl Normal {
-    /// (distribution function, density) at `x`.
-    #[inline]
-    fn at(&self, x: f32) -> (f32, f32) {
-        if x <= -NORMAL_REACH {
-            return (0.0, 0.0);
-        }
-        if x >= NORMAL_REACH {
-            return (1.0, 0.0);
-        }
-        let t = (x + NORMAL_REACH) * NORMAL_STEPS;
-        let i = t as usize;
-        let f = t - i as f32;
-        let (a, b) = (self.table[i], self.table[i + 1]);
-        (a.0 + (b.0 - a.0) * f, a.1 + (b.1 - a.1) * f)
-    }
-}
-
-/// Standard normal distribution function and density at `x`, from the table.
-pub(crate) fn normal_at(x: f32) -> (f32, f32) {
-    normal().at(x)
-}
-
-/// Blurred darkness (0 white, 1 black) at a pixel, its derivatives with respect to the pixel and
-/// to the blur, and the distance from the mark's edge (negative inside).
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Darkness {
-    pub value: f32,
-    pub du: f32,
-    pub dv: f32,
-    pub dsigma: f32,
-    pub edge_px: f32,
-}
-
-/// Evaluates a mark's image around its centre in single precision.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct MarkModel {
-    inverse: [[f32; 2]; 2],
-    g: [f32; 2],
-    sigma: f32,
-    size_m: f32,
-    kind: MarkKind,
-    normal: &'static Normal,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum MarkKind {
-    Disc,
-    Saddle,
-}
-
-impl MarkModel {
-    /// `map` must be centred on the disc.
-    pub fn disc(map: &LocalMap, disc: &Disc, sigma_px: f64) -> Self {
-        Self::new(map, disc.radius_m, sigma_px, MarkKind::Disc)
-    }
-
-    /// `map` must be centred on the saddle.
-    pub fn saddle(map: &LocalMap, saddle: &Saddle, sigma_px: f64) -> Self {
-        Self::new(map, saddle.half_size_m, sigma_px, MarkKind::Saddle)
-    }
-
-    fn new(map: &LocalMap, size_m: f64, sigma_px: f64, kind: MarkKind) -> Self {
-        let i = map.inverse.map(|x| x as f32);
-        Self {
-            inverse: [[i.m11, i.m12], [i.m21, i.m22]],
-            g: [map.g.x as f32, map.g.y as f32],
-            sigma: sigma_px as f32,
-            size_m: size_m as f32,
-            kind,
-            normal: normal(),
-        }
-    }
-
-    /// At an offset (px) from the mark's centre.
-    #[inline]
-    pub fn at(&self, du: f32, dv: f32) -> Darkness {
-        match self.kind {
-            MarkKind::Disc => self.disc_at(du, dv),
-            MarkKind::Saddle => self.saddle_at(du, dv),
-        }
-    }
-
-    /// Offset on the plate (m) and the factor that perspective puts on the inverse map there.
-    #[inline]
-    fn on_plate(&self, du: f32, dv: f32) -> (f32, f32, f32) {
-        let i = &self.inverse;
-        let qx = i[0][0] * du + i[0][1] * dv;
-        let qy = i[1][0] * du + i[1][1] * dv;
-        let w = 1.0 / (1.0 - self.g[0] * qx - self.g[1] * qy);
-        (qx * w, qy * w, w)
-    }
-
-    #[inline]
-    fn disc_at(&self, du: f32, dv: f32) -> Darkness {
-        let (x, y, w) = self.on_plate(du, dv);
-        let i = &self.inverse;
-        let radius = (x * x + y * y).sqrt();
-        if radius < 1e-3 * self.size_m {
-            return Darkness {
-                value: 1.0,
-                du: 0.0,
-                dv: 0.0,
-                dsigma: 0.0,
-                edge_px: -1e3,
-            };
-        }
-        let (nx, ny) = (x / radius, y / radius);
-        // gradient of the radius in the image, m/px
-        let (gu, gv) = (
-            (nx * i[0][0] + ny * i[1][0]) * w,
-            (nx * i[0][1] + ny * i[1][1]) * w,
-        );
-        let slope = (gu * gu + gv * gv).sqrt();
-        let edge_px = (radius - self.size_m) / slope;
-        let z = edge_px / self.sigma;
-        let (p, density) = self.normal.at(-z);
-        let rate = density / self.sigma;
-        Darkness {
-            value: p,
-            du: -rate * gu / slope,
-            dv: -rate * gv / slope,
-            dsigma: rate * z,
-            edge_px,
-        }
-    }
-
-    #[inline]
-    fn saddle_at(&self, du: f32, dv: f32) -> Darkness {
-        let (x, y, w) = self.on_plate(du, dv);
-        let i = &self.inverse;
-        let line = |value: f32, row: [f32; 2]| {
-            let slope = (row[0] * row[0] + row[1] * row[1]).sqrt() * w;
-            let z = value / slope / self.sigma;
-            let (p, density) = self.normal.at(z);
-            let rate = 2.0 * density / self.sigma;
-            let unit = [row[0] * w / slope, row[1] * w / slope];
-            (2.0 * p - 1.0, rate, unit, -rate * z, slope)
-        };
-        let (ex, rate_x, unit_x, ex_s, slope_x) = line(x, i[0]);
-        let (ey, rate_y, unit_y, ey_s, slope_y) = line(y, i[1]);
-        let edge_x = (x.abs() - self.size_m) / slope_x;
-        let edge_y = (y.abs() - self.size_m) / slope_y;
-        let (edge_px, outward) = if edge_x >= edge_y {
-            (edge_x, unit_x.map(|c| c * x.signum()))
-        } else {
-            (edge_y, unit_y.map(|c| c * y.signum()))
-        };
-        let inner = 0.5 + 0.5 * ex * ey;
-        let inner_u = 0.5 * (rate_x * unit_x[0] * ey + ex * rate_y * unit_y[0]);
-        let inner_v = 0.5 * (rate_x * unit_x[1] * ey + ex * rate_y * unit_y[1]);
-        // the checker ends at the square's border, blurred like any edge
-        let z = edge_px / self.sigma;
-        let (inside, density) = self.normal.at(-z);
-        let fade = density / self.sigma;
-        Darkness {
-            value: inner * inside,
-            du: inner_u * inside - inner * fade * outward[0],
-            dv: inner_v * inside - inner * fade * outward[1],
-            dsigma: 0.5 * (ex_s * ey + ex * ey_s) * inside + inner * fade * z,
-            edge_px,
-        }
-    }
-}
-
 /// Which part of the plate a picture shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Part {
@@ -322,7 +121,7 @@ pub(super) struct Picture {
     pub step_px: f64,
     /// Darkness, 0 to 1.
     pub values: Vec<f32>,
-    /// Derivatives per image px.
+    /// Derivatives per image px; empty if they were not asked for.
     pub du: Vec<f32>,
     pub dv: Vec<f32>,
     /// Whether the pixel shows the part, at least one blur radius inside its edge.
@@ -366,8 +165,9 @@ pub(super) fn bounds(
     (low, high)
 }
 
-/// Draws a part. The grid starts at `origin_px`; `sigma_px` is the blur in image px. `None` if the
-/// map is degenerate.
+/// Draws a part, with its derivatives if `slopes`. The grid starts at `origin_px`; `sigma_px` is the
+/// blur in image px. `None` if the map is degenerate.
+#[allow(clippy::too_many_arguments)] // what a picture is made of
 pub(super) fn draw(
     layout: &PlateLayout,
     part: Part,
@@ -376,71 +176,180 @@ pub(super) fn draw(
     origin_px: Vector2<f64>,
     step_px: f64,
     (width, height): (usize, usize),
+    slopes: bool,
 ) -> Option<Picture> {
     let count = width * height;
+    let sloped = if slopes { count } else { 0 };
     let mut picture = Picture {
         width,
         height,
         origin_px,
         step_px,
         values: vec![0.0; count],
-        du: vec![0.0; count],
-        dv: vec![0.0; count],
+        du: vec![0.0; sloped],
+        dv: vec![0.0; sloped],
         mask: vec![false; count],
     };
     let (centre, half) = extent(layout, part);
-    let inset = sigma_px.max(0.5 * step_px);
-    let around = map.at(&centre)?;
-    let frame = MarkModel::new(&around, half.x.max(half.y), sigma_px, MarkKind::Saddle);
-    let (hx, hy) = (half.x as f32, half.y as f32);
-    for j in 0..height {
-        let dv = (origin_px.y + j as f64 * step_px - around.pixel_px.y) as f32;
-        for i in 0..width {
-            let du = (origin_px.x + i as f64 * step_px - around.pixel_px.x) as f32;
-            let (x, y, w) = frame.on_plate(du, dv);
-            let slope = |row: [f32; 2]| (row[0] * row[0] + row[1] * row[1]).sqrt() * w;
-            let inside_x = (hx - x.abs()) / slope(frame.inverse[0]);
-            let inside_y = (hy - y.abs()) / slope(frame.inverse[1]);
-            picture.mask[j * width + i] = inside_x.min(inside_y) >= inset as f32;
-        }
-    }
-    let mut paint = |mark: MarkModel, local: &LocalMap, reach_m: f64| {
-        let reach = reach_m * local.scales().1 * 1.1 + 3.5 * sigma_px;
-        let from = (local.pixel_px - origin_px).map(|x| (x - reach) / step_px);
-        let to = (local.pixel_px - origin_px).map(|x| (x + reach) / step_px);
-        let range = |a: f64, b: f64, size: usize| {
-            (a.ceil().clamp(0.0, size as f64) as usize)
-                ..((b.floor() + 1.0).clamp(0.0, size as f64) as usize)
-        };
-        for j in range(from.y, to.y, height) {
-            let dv = (origin_px.y + j as f64 * step_px - local.pixel_px.y) as f32;
-            for i in range(from.x, to.x, width) {
-                let du = (origin_px.x + i as f64 * step_px - local.pixel_px.x) as f32;
-                let d = mark.at(du, dv);
-                let k = j * width + i;
-                picture.values[k] += d.value;
-                picture.du[k] += d.du;
-                picture.dv[k] += d.dv;
-            }
-        }
+    let frame = Frame {
+        half_m: [half.x as f32, half.y as f32],
+        inset_px: sigma_px.max(0.5 * step_px) as f32,
     };
+    picture.frame(&map.at(&centre)?, &frame);
     if part == Part::Plate {
         for disc in &layout.discs {
             let local = map.at(&Vector2::new(disc.x_m, disc.y_m))?;
-            paint(
-                MarkModel::disc(&local, disc, sigma_px),
-                &local,
-                disc.radius_m,
-            );
+            let mark = MarkModel::disc(&local, disc, sigma_px);
+            picture.paint(&mark, &local, disc.radius_m, sigma_px);
         }
     }
     if let Some(s) = &layout.saddle {
         let local = map.at(&Vector2::new(s.x_m, s.y_m))?;
-        paint(
-            MarkModel::saddle(&local, s, sigma_px),
-            &local,
-            s.half_size_m * std::f64::consts::SQRT_2,
-        );
+        let mark = MarkModel::saddle(&local, s, sigma_px);
+        let reach_m = s.half_size_m * std::f64::consts::SQRT_2;
+        picture.paint(&mark, &local, reach_m, sigma_px);
     }
     Some(picture)
+}
+
+/// The outline of a part around its centre.
+struct Frame {
+    half_m: [f32; 2],
+    inset_px: f32,
+}
+
+impl Picture {
+    /// Offsets (px) of the grid's column `i` and row `j` from a pixel.
+    fn offset(&self, from_px: &Vector2<f64>, i: usize, j: usize) -> (f32, f32) {
+        let at =
+            |k: usize, n: usize| (self.origin_px[k] + n as f64 * self.step_px - from_px[k]) as f32;
+        (at(0, i), at(1, j))
+    }
+
+    /// Fills the mask.
+    fn frame(&mut self, around: &LocalMap, frame: &Frame) {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            return unsafe { self.frame_avx2(around, frame) };
+        }
+        self.frame_plain(around, frame);
+    }
+
+    /// The same with wider vectors.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn frame_avx2(&mut self, around: &LocalMap, frame: &Frame) {
+        self.frame_plain(around, frame);
+    }
+
+    #[inline(always)]
+    fn frame_plain(&mut self, around: &LocalMap, frame: &Frame) {
+        let inverse = Inverse::new(around);
+        let (half, inset) = (frame.half_m, frame.inset_px);
+        // half size (m) times D less |q| is to be that large
+        let least = inverse.slopes.map(|s| s * inset);
+        for j in 0..self.height {
+            for i in (0..self.width).step_by(LANES) {
+                let (du, dv) = self.offset(&around.pixel_px, i, j);
+                let [x, y, d] = inverse.at(&ramp(du, self.step_px as f32), dv);
+                let inside: Lane = each(|k| {
+                    let a = half[0] * d[k] - x[k].abs() - least[0];
+                    smaller(a, half[1] * d[k] - y[k].abs() - least[1])
+                });
+                let last = (i + LANES).min(self.width);
+                let out = &mut self.mask[j * self.width + i..j * self.width + last];
+                if let Some(whole) = out.first_chunk_mut::<LANES>() {
+                    *whole = inside.map(|x| x >= 0.0);
+                    continue;
+                }
+                for (o, x) in out.iter_mut().zip(inside) {
+                    *o = x >= 0.0;
+                }
+            }
+        }
+    }
+
+    /// Adds a mark's image around the place that `local` is centred on.
+    fn paint(&mut self, mark: &MarkModel, local: &LocalMap, reach_m: f64, sigma_px: f64) {
+        let reach = reach_m * local.scales().1 * 1.1 + 3.5 * sigma_px;
+        let from = (local.pixel_px - self.origin_px).map(|x| (x - reach) / self.step_px);
+        let to = (local.pixel_px - self.origin_px).map(|x| (x + reach) / self.step_px);
+        let range = |a: f64, b: f64, size: usize| {
+            (a.ceil().clamp(0.0, size as f64) as usize)
+                ..((b.floor() + 1.0).clamp(0.0, size as f64) as usize)
+        };
+        let (columns, rows) = (
+            range(from.x, to.x, self.width),
+            range(from.y, to.y, self.height),
+        );
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has AVX2.
+            return unsafe { self.add_avx2(mark, &local.pixel_px, columns, rows) };
+        }
+        self.add_either(mark, &local.pixel_px, columns, rows);
+    }
+
+    /// The same with wider vectors.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn add_avx2(
+        &mut self,
+        mark: &MarkModel,
+        at_px: &Vector2<f64>,
+        columns: Range<usize>,
+        rows: Range<usize>,
+    ) {
+        self.add_either(mark, at_px, columns, rows);
+    }
+
+    #[inline(always)]
+    fn add_either(
+        &mut self,
+        mark: &MarkModel,
+        at_px: &Vector2<f64>,
+        columns: Range<usize>,
+        rows: Range<usize>,
+    ) {
+        if self.du.is_empty() {
+            self.add_plain::<false>(mark, at_px, columns, rows);
+        } else {
+            self.add_plain::<true>(mark, at_px, columns, rows);
+        }
+    }
+
+    #[inline(always)]
+    fn add_plain<const SLOPES: bool>(
+        &mut self,
+        mark: &MarkModel,
+        at_px: &Vector2<f64>,
+        columns: Range<usize>,
+        rows: Range<usize>,
+    ) {
+        for j in rows {
+            for i in columns.clone().step_by(LANES) {
+                let (du, dv) = self.offset(at_px, i, j);
+                let d = mark.at(&ramp(du, self.step_px as f32), dv);
+                let cells = j * self.width + i..j * self.width + (i + LANES).min(columns.end);
+                add(&mut self.values[cells.clone()], &d.value);
+                if SLOPES {
+                    add(&mut self.du[cells.clone()], &d.du);
+                    add(&mut self.dv[cells], &d.dv);
+                }
+            }
+        }
+    }
+}
+
+/// Adds as many lanes as there are places.
+#[inline(always)]
+fn add(out: &mut [f32], lanes: &Lane) {
+    if let Some(whole) = out.first_chunk_mut::<LANES>() {
+        *whole = each(|k| whole[k] + lanes[k]);
+        return;
+    }
+    for (o, x) in out.iter_mut().zip(lanes) {
+        *o += x;
+    }
 }

@@ -2,7 +2,7 @@
 
 use nalgebra::{Isometry3, Vector2, Vector3};
 
-use super::align::Candidate;
+use super::locate::Candidate;
 use super::mark::{Mark, MarkFit, PointFault, fit};
 use super::model::LocalMap;
 use super::pose::{Sighting, solve_pose};

@@ -115,15 +115,22 @@ fn thresholds(image: &Image8, window: Window, contrast: u8) -> (usize, Vec<Optio
     let (w, h) = (window.width as usize, window.height as usize);
     let (width, height) = (w.div_ceil(TILE), h.div_ceil(TILE));
     let mut ranges = vec![Range { low: 255, high: 0 }; width * height];
-    for y in 0..h {
-        let row = &image.pixels
-            [(window.top as usize + y) * image.width_px as usize + window.left as usize..][..w];
-        let out = &mut ranges[y / TILE * width..][..width];
-        for (r, tile) in out.iter_mut().zip(row.chunks(TILE)) {
-            for &p in tile {
-                r.low = r.low.min(p);
-                r.high = r.high.max(p);
+    // column by column over the rows of a tile, then over its columns
+    let (mut lows, mut highs) = (vec![255u8; w], vec![0u8; w]);
+    for (j, out) in ranges.chunks_exact_mut(width).enumerate() {
+        lows.fill(255);
+        highs.fill(0);
+        for y in j * TILE..h.min((j + 1) * TILE) {
+            let row = row_of(image, window, y);
+            for ((low, high), &p) in lows.iter_mut().zip(&mut highs).zip(row) {
+                *low = p.min(*low);
+                *high = p.max(*high);
             }
+        }
+        let tiles = lows.chunks(TILE).zip(highs.chunks(TILE));
+        for (r, (low, high)) in out.iter_mut().zip(tiles) {
+            r.low = low.iter().fold(255, |m, &p| p.min(m));
+            r.high = high.iter().fold(0, |m, &p| p.max(m));
         }
     }
     let mut levels = vec![Level {
@@ -197,6 +204,29 @@ fn next_bit<const SET: bool>(words: &[u64], from: usize) -> Option<usize> {
         })
 }
 
+/// One row of a window's pixels.
+fn row_of(image: &Image8, window: Window, y: usize) -> &[u8] {
+    let start = (window.top as usize + y) * image.width_px as usize + window.left as usize;
+    &image.pixels[start..start + window.width as usize]
+}
+
+/// One bit for each pixel of a tile's row: below the limit if `dark`, else at or above it.
+#[inline]
+fn beyond_limit(pixels: &[u8], limit: u8, dark: bool) -> u8 {
+    let mut ones = [0u8; TILE];
+    if let Some(whole) = pixels.first_chunk::<TILE>() {
+        for k in 0..TILE {
+            ones[k] = u8::from((whole[k] < limit) == dark);
+        }
+    } else {
+        for (one, &p) in ones.iter_mut().zip(pixels) {
+            *one = u8::from((p < limit) == dark);
+        }
+    }
+    // every product puts one of the eight ones into the highest byte
+    (u64::from_le_bytes(ones).wrapping_mul(0x0102_0408_1020_4080) >> 56) as u8
+}
+
 /// Runs of a clipped window's pixels beyond the threshold, joined where they touch.
 fn label(image: &Image8, window: Window, rules: &BlobRules) -> Vec<Run> {
     let (w, h) = (window.width as usize, window.height as usize);
@@ -209,17 +239,12 @@ fn label(image: &Image8, window: Window, rules: &BlobRules) -> Vec<Run> {
     let mut beyond = vec![0u64; w / 64 + 1];
     let (mut above, mut above_end) = (0usize, 0usize);
     for y in 0..h {
-        let row = &image.pixels
-            [(window.top as usize + y) * image.width_px as usize + window.left as usize..][..w];
         let limits = &thresholds[y / TILE * tiles..][..tiles];
         beyond.fill(0);
-        for (t, (pixels, limit)) in row.chunks(TILE).zip(limits).enumerate() {
-            // nothing is below 0, nothing at 256
-            let limit = limit.map_or(if rules.dark { 0 } else { 256 }, u16::from);
-            let mut bits = 0u64;
-            for (k, &p) in pixels.iter().enumerate() {
-                bits |= u64::from((u16::from(p) < limit) == rules.dark) << k;
-            }
+        let row = row_of(image, window, y).chunks(TILE);
+        for (t, (pixels, limit)) in row.zip(limits).enumerate() {
+            let Some(limit) = limit else { continue };
+            let bits = u64::from(beyond_limit(pixels, *limit, rules.dark));
             beyond[t * TILE / 64] |= bits << (t * TILE % 64);
         }
         let first = runs.len();

@@ -6,6 +6,7 @@
 //! work.
 
 mod dots;
+mod masked;
 mod narrow;
 mod pyramid;
 mod score;

@@ -1,6 +1,7 @@
 //! Scores over a range of positions, and their peaks.
 
 use super::dots::dots;
+use super::masked;
 use super::small::{self, Extent, Scale};
 use super::{FLAT_DN, SCALE, SearchImage, Template};
 
@@ -233,13 +234,23 @@ pub fn score_map(
         inverse_norm: 1.0 / template.norm,
         flat: (n * (FLAT_DN * f64::from(SCALE)).powi(2)) as f32,
     };
-    if small::is_small(template) {
-        let extent = Extent {
+    let extent = Extent {
+        left,
+        top,
+        width,
+        height,
+    };
+    if masked::is_for(template, &extent) {
+        masked::scores(image, template, extent, &scale, &mut scores);
+        return Some(ScoreMap {
             left,
             top,
             width,
             height,
-        };
+            scores,
+        });
+    }
+    if small::is_small(template) {
         small::scores(image, template, extent, &scale, &mut scores);
         return Some(ScoreMap {
             left,

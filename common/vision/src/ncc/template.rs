@@ -44,6 +44,8 @@ pub struct Template {
     pub(super) height: usize,
     pub(super) stride: usize,
     pub(super) values: Vec<i16>,
+    /// 1 inside the mask and 0 outside, laid out as `values`; empty if all is inside.
+    pub(super) mask: Vec<i16>,
     pub(super) spans: Vec<Span>,
     pub(super) rectangular: bool,
     pub(super) count: usize,
@@ -81,6 +83,36 @@ fn spans_of(mask: &[bool], width: usize) -> Vec<Span> {
     spans
 }
 
+/// One run for each row.
+fn whole_rows(width: usize, height: usize) -> Vec<Span> {
+    let whole = |row| Span {
+        row,
+        start: 0,
+        end: width,
+    };
+    (0..height).map(whole).collect()
+}
+
+/// Two sums over values, in four parts each, which need not wait for each other.
+fn sums(values: &[f32], of: impl Fn(f64) -> [f64; 2]) -> [f64; 2] {
+    let (mut a, mut b) = ([0.0f64; 4], [0.0f64; 4]);
+    let fours = values.chunks_exact(4);
+    let rest = fours.remainder();
+    for four in fours {
+        for k in 0..4 {
+            let [x, y] = of(f64::from(four[k]));
+            a[k] += x;
+            b[k] += y;
+        }
+    }
+    for (k, &x) in rest.iter().enumerate() {
+        let [x, y] = of(f64::from(x));
+        a[k] += x;
+        b[k] += y;
+    }
+    [a, b].map(|x| (x[0] + x[1]) + (x[2] + x[3]))
+}
+
 /// Most pixels in a template.
 const MAX_COUNT: usize = 65_536;
 
@@ -109,30 +141,26 @@ impl Template {
         {
             return Err(wrong(mask.len()));
         }
-        let inside = |i: usize| mask.is_none_or(|m| m[i]);
-        let count = mask.map_or(values.len(), |m| m.iter().filter(|&&on| on).count());
+        let spans = mask.map_or_else(|| whole_rows(width, height), |m| spans_of(m, width));
+        let count = spans.iter().map(|s| s.end - s.start).sum();
         if !(2..=MAX_COUNT).contains(&count) {
             return Err(TemplateError::BadCount {
                 found: count,
                 limit: MAX_COUNT,
             });
         }
-        let chosen = || {
-            values
-                .iter()
-                .enumerate()
-                .filter(|&(i, _)| inside(i))
-                .map(|(_, &x)| x)
-        };
-        let n = count as f64;
-        let mean = chosen().map(f64::from).sum::<f64>() / n;
-        let (mut largest, mut size_sum, mut square_sum) = (0.0f64, 0.0f64, 0.0f64);
-        for x in chosen() {
-            let d = f64::from(x) - mean;
-            largest = largest.max(d.abs());
-            size_sum += d.abs();
-            square_sum += d * d;
+        let run = |s: &Span| s.row * width + s.start..s.row * width + s.end;
+        let mut chosen = Vec::with_capacity(count);
+        for s in &spans {
+            chosen.extend_from_slice(&values[run(s)]);
         }
+        let n = count as f64;
+        let mean = sums(&chosen, |x| [x, 0.0])[0] / n;
+        let [size_sum, square_sum] = sums(&chosen, |x| [(x - mean).abs(), (x - mean) * (x - mean)]);
+        let (low, high) = chosen.iter().fold((f32::MAX, f32::MIN), |(low, high), &x| {
+            (low.min(x), high.max(x))
+        });
+        let largest = (f64::from(high) - mean).max(mean - f64::from(low));
         let deviation = (square_sum / n).sqrt();
         if !deviation.is_finite() || deviation <= 1e-6 * (1.0 + mean.abs()) {
             return Err(TemplateError::NoContrast(deviation));
@@ -143,17 +171,25 @@ impl Template {
         let stride = width.div_ceil(LANES) * LANES;
         let mut quantised = vec![0i16; stride * height];
         let (mut sum, mut square) = (0i64, 0i64);
-        let lines = quantised
-            .chunks_exact_mut(stride)
-            .zip(values.chunks_exact(width));
-        for (row, (out, line)) in lines.enumerate() {
-            for (column, (o, &x)) in out.iter_mut().zip(line).enumerate() {
-                if inside(row * width + column) {
-                    let q = round_to_i16((x - mean as f32) * gain);
-                    *o = q;
-                    sum += i64::from(q);
-                    square += i64::from(i32::from(q) * i32::from(q));
-                }
+        for s in &spans {
+            let out = &mut quantised[s.row * stride + s.start..s.row * stride + s.end];
+            // a row's values are at most 4096, and there are at most 65536 of them
+            let (mut row_sum, mut row_square) = (0i32, 0i64);
+            for (o, &x) in out.iter_mut().zip(&values[run(s)]) {
+                let q = round_to_i16((x - mean as f32) * gain);
+                *o = q;
+                row_sum += i32::from(q);
+                row_square += i64::from(i32::from(q) * i32::from(q));
+            }
+            sum += i64::from(row_sum);
+            square += row_square;
+        }
+        let rectangular = count == width * height;
+        let mut mask = Vec::new();
+        if !rectangular {
+            mask = vec![0i16; stride * height];
+            for s in &spans {
+                mask[s.row * stride + s.start..s.row * stride + s.end].fill(1);
             }
         }
         // Rounding leaves a small mean; the score takes it into account.
@@ -163,8 +199,9 @@ impl Template {
             height,
             stride,
             values: quantised,
-            spans: mask.map_or_else(Vec::new, |m| spans_of(m, width)),
-            rectangular: count == width * height,
+            mask,
+            spans,
+            rectangular,
             count,
             mean: sum as f64 / n,
             norm,
