@@ -168,6 +168,7 @@ impl Normal {
 }
 
 /// Standard normal distribution function and density at `x`, from the table.
+#[inline]
 pub(crate) fn normal_at(x: f32) -> (f32, f32) {
     normal().at(x)
 }

@@ -7,8 +7,9 @@
 
 use nalgebra::{SMatrix, SVector, Vector2};
 
-use super::lanes::{LANES, Lane, MarkModel, add_products, each, larger, ramp, smaller, total};
+use super::lanes::MarkModel;
 use super::model::LocalMap;
+use super::window::{EdgeDistance, GREY, MIDDLE_DN, Window};
 use super::{DetectionRules, PointKind};
 use crate::image::Image8;
 use crate::plate::PlateLayout;
@@ -102,8 +103,6 @@ const SETTLED_FROM_POSE_PX: f64 = 0.02;
 const ROUGHLY_SETTLED_PX: f64 = 0.05;
 /// Bounds of the fitted blur, px.
 const BLUR_RANGE_PX: (f64, f64) = (0.4, 3.0);
-/// Width of the strip along the plate's border that the surroundings blur into, px.
-const EDGE_STRIP_PX: f64 = 1.2;
 /// Strip along the checker's border that is left out, in units of the blur.
 const CHECKER_RIM: f64 = 1.5;
 /// Least weight (px of window) for a fit.
@@ -111,7 +110,7 @@ const MIN_WEIGHT_PX: f64 = 16.0;
 
 /// What is fitted around a point, apart from its position.
 pub(super) struct Mark<'a> {
-    layout: &'a PlateLayout,
+    pub layout: &'a PlateLayout,
     index: usize,
     kind: PointKind,
     pub at_m: Vector2<f64>,
@@ -381,191 +380,4 @@ fn mean_variance(l: &SMatrix<f64, 5, 5>) -> f64 {
         sum
     };
     0.5 * (variance(0) + variance(1))
-}
-
-/// The pixels around a mark's centre and what they are compared with.
-struct Window {
-    model: MarkModel,
-    edge: EdgeDistance,
-    kind: PointKind,
-    centre: Vector2<f64>,
-    reach_px: f64,
-    /// White beyond a disc's edge, px.
-    margin_px: f32,
-    /// Strip along the checker's border that is left out, px.
-    rim_px: f32,
-    /// Radius of the checker's window, px.
-    radius_px: f32,
-    /// See [`DetectionRules::saturation_dn`], less [`MIDDLE_DN`].
-    saturation_dn: f32,
-}
-
-/// Subtracted from the grey values, to keep the sums of their squares small, DN.
-const MIDDLE_DN: f32 = 128.0;
-
-/// Lower triangle of the normal equations, row by row: du, dv, darkness, one, grey value, blur.
-type Sums = [f64; 21];
-/// Place of the grey value among them.
-const GREY: usize = 4;
-
-/// Rows whose sums are held in single precision.
-const ROWS_AT_ONCE: usize = 4;
-
-impl Window {
-    /// The sums over the window, those with the blur only if it is free, and the fraction of the
-    /// pixels that are saturated.
-    fn accumulate(&self, image: &Image8, free_blur: bool) -> (Sums, f64) {
-        #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") {
-            // SAFETY: the processor has AVX2.
-            return unsafe {
-                if free_blur {
-                    self.accumulate_avx2::<true>(image)
-                } else {
-                    self.accumulate_avx2::<false>(image)
-                }
-            };
-        }
-        if free_blur {
-            self.accumulate_plain::<true>(image)
-        } else {
-            self.accumulate_plain::<false>(image)
-        }
-    }
-
-    /// The same with wider vectors.
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2")]
-    fn accumulate_avx2<const BLUR: bool>(&self, image: &Image8) -> (Sums, f64) {
-        self.accumulate_plain::<BLUR>(image)
-    }
-
-    #[inline(always)]
-    fn accumulate_plain<const BLUR: bool>(&self, image: &Image8) -> (Sums, f64) {
-        let width = image.width_px as usize;
-        let (centre, reach) = (self.centre, self.reach_px);
-        let (top, bottom) = (
-            (centre.y - reach).ceil() as usize,
-            (centre.y + reach) as usize,
-        );
-        let (mut saturated, mut counted) = ([0.0f32; LANES], [0.0f32; LANES]);
-        let mut sums = [0.0f64; 21];
-        for first_row in (top..=bottom).step_by(ROWS_AT_ONCE) {
-            let mut rows = [[0.0f32; LANES]; 21];
-            for v in first_row..=bottom.min(first_row + ROWS_AT_ONCE - 1) {
-                let offset = v as f64 - centre.y;
-                // no pixel further away than the reach counts
-                let half = (reach * reach - offset * offset).max(0.0).sqrt();
-                let (first, last) = (
-                    (centre.x - half).ceil() as usize,
-                    (centre.x + half) as usize,
-                );
-                let dv = offset as f32;
-                for u in (first..=last).step_by(LANES) {
-                    let du = ramp((u as f64 - centre.x) as f32, 1.0);
-                    let d = self.model.at(&du, dv);
-                    let weight = self.weights(&d.edge_px, &du, dv, (last - u) as f32);
-                    let grey = greys(&image.pixels, v * width + u);
-                    let on = each(|k| if weight[k] > 0.0 { 1.0 } else { 0.0 });
-                    let clipped = each(|k| {
-                        if grey[k] >= self.saturation_dn {
-                            1.0
-                        } else {
-                            0.0
-                        }
-                    });
-                    counted = each(|k| counted[k] + on[k]);
-                    saturated = each(|k| saturated[k] + on[k] * clipped[k]);
-                    let a = [
-                        each(|k| -d.du[k]),
-                        each(|k| -d.dv[k]),
-                        d.value,
-                        [1.0; LANES],
-                        grey,
-                        d.dsigma,
-                    ];
-                    let weighted = |p: usize| each(|k| weight[k] * a[p][k]);
-                    add_products::<0>(&mut rows, &a, &weighted(0));
-                    add_products::<1>(&mut rows, &a, &weighted(1));
-                    add_products::<2>(&mut rows, &a, &weighted(2));
-                    add_products::<3>(&mut rows, &a, &weight);
-                    add_products::<4>(&mut rows, &a, &weighted(4));
-                    if BLUR {
-                        add_products::<5>(&mut rows, &a, &weighted(5));
-                    }
-                }
-            }
-            for (s, r) in sums.iter_mut().zip(&rows) {
-                *s += f64::from(total(r));
-            }
-        }
-        let fraction = f64::from(total(&saturated)) / f64::from(total(&counted)).max(1.0);
-        (sums, fraction)
-    }
-
-    /// What pixels count for, 0 to 1; 0 from the lane after `last` on.
-    #[inline(always)]
-    fn weights(&self, edge_px: &Lane, du: &Lane, dv: f32, last: f32) -> Lane {
-        let lane = ramp(0.0, 1.0);
-        let own = match self.kind {
-            PointKind::Disc => each(|k| self.margin_px - edge_px[k]),
-            PointKind::Saddle => each(|k| {
-                let inside = self.radius_px - (du[k] * du[k] + dv * dv).sqrt();
-                smaller(-edge_px[k] - self.rim_px, inside)
-            }),
-        };
-        let border = self.edge.at(du, dv);
-        each(|k| {
-            let weight = smaller(larger(smaller(own[k], border[k]), 0.0), 1.0);
-            if lane[k] <= last { weight } else { 0.0 }
-        })
-    }
-}
-
-/// Grey values less [`MIDDLE_DN`] from `start` on; the last one again beyond the end.
-#[inline(always)]
-fn greys(pixels: &[u8], start: usize) -> Lane {
-    let bytes = match pixels[start..].first_chunk::<LANES>() {
-        Some(bytes) => *bytes,
-        None => std::array::from_fn(|k| pixels[(start + k).min(pixels.len() - 1)]),
-    };
-    each(|k| f32::from(bytes[k]) - MIDDLE_DN)
-}
-
-/// Distance (px, less the blurred strip) of a pixel from the plate's border, to first order.
-struct EdgeDistance {
-    along: [[f32; 2]; 2],
-    at: [f32; 2],
-    half: [f32; 2],
-}
-
-impl EdgeDistance {
-    fn new(mark: &Mark, map: &LocalMap) -> Self {
-        let row = |i: usize| {
-            let r = map.inverse.row(i);
-            (r[0] as f32, r[1] as f32, r.norm())
-        };
-        let ((xu, xv, xn), (yu, yv, yn)) = (row(0), row(1));
-        let scale = |value: f64, norm: f64| (value / norm) as f32;
-        Self {
-            along: [
-                [xu / xn as f32, xv / xn as f32],
-                [yu / yn as f32, yv / yn as f32],
-            ],
-            at: [scale(mark.at_m.x, xn), scale(mark.at_m.y, yn)],
-            half: [
-                scale(mark.layout.half_width_m, xn),
-                scale(mark.layout.half_height_m, yn),
-            ],
-        }
-    }
-
-    #[inline(always)]
-    fn at(&self, du: &Lane, dv: f32) -> Lane {
-        let axis = |i: usize, k: usize| {
-            let x = self.at[i] + self.along[i][0] * du[k] + self.along[i][1] * dv;
-            self.half[i] - x.abs()
-        };
-        each(|k| smaller(axis(0, k), axis(1, k)) - EDGE_STRIP_PX as f32)
-    }
 }

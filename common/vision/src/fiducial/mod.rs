@@ -14,6 +14,7 @@ mod model;
 mod points;
 mod pose;
 mod rules;
+mod window;
 
 use nalgebra::{Isometry3, Vector2, Vector3};
 use rover_cameras::Camera;

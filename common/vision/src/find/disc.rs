@@ -167,8 +167,16 @@ impl Ellipse {
 }
 
 impl PixelModel<6> for Ellipse {
-    fn at(&self, p: &[f64; 6], u: f64, v: f64, slopes: &mut [f64; 6]) -> (f64, f64) {
-        let [a, b, c] = self.matrix(p);
+    /// The parameters and the matrix.
+    type Shared = ([f64; 6], [f64; 3]);
+
+    fn shared(&self, p: &[f64; 6]) -> Self::Shared {
+        (*p, self.matrix(p))
+    }
+
+    #[inline(always)]
+    fn at(&self, shared: &Self::Shared, u: f64, v: f64, slopes: &mut [f64; 6]) -> (f64, f64) {
+        let (p, [a, b, c]) = shared;
         let (du, dv) = (u - p[0], v - p[1]);
         let (x, y) = (a * du + b * dv, b * du + c * dv);
         let radius = (x * x + y * y).sqrt();

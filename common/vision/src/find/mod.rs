@@ -21,6 +21,7 @@ mod homography;
 mod pixels;
 mod plate;
 mod saddle;
+mod sums;
 mod tag_code;
 mod tags;
 mod template;

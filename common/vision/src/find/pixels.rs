@@ -11,13 +11,20 @@
 use nalgebra::{DMatrix, DVector};
 
 use super::NoFinding;
+use super::sums::{Brightness, LINEAR, accumulate};
 use crate::image::Image8;
 use crate::ncc::Window;
 
 /// A shape with `N` parameters.
 pub(super) trait PixelModel<const N: usize> {
+    /// What all pixels share for given parameters.
+    type Shared;
+
+    /// What all pixels share.
+    fn shared(&self, p: &[f64; N]) -> Self::Shared;
+
     /// Value (any unit), its derivatives by the parameters, and the pixel's weight (0 to 1).
-    fn at(&self, p: &[f64; N], u: f64, v: f64, slopes: &mut [f64; N]) -> (f64, f64);
+    fn at(&self, shared: &Self::Shared, u: f64, v: f64, slopes: &mut [f64; N]) -> (f64, f64);
 
     /// Number of deformations of the shape that are tested.
     const DEFORMATIONS: usize;
@@ -256,119 +263,11 @@ const SETTLED_PX: f64 = 0.002;
 const PATIENCE: usize = 5;
 const HOPELESS_SCORE: f64 = std::f64::consts::FRAC_1_SQRT_2;
 /// Grey values from here on count as clipped, DN.
-const SATURATION_DN: u8 = 254;
+pub(super) const SATURATION_DN: u8 = 254;
 /// Quantisation alone has this standard deviation, DN.
 const QUANTISATION_DN: f64 = 0.29;
 /// Least weight of a window, px.
 const MIN_WEIGHT_PX: f64 = 16.0;
-
-/// Linear parameters beside the shape's: slope of light in u and v, value, one.
-const LINEAR: usize = 4;
-
-/// Brightness by which light multiplies: the model's image in units of its own mean size.
-#[derive(Clone, Copy, Debug)]
-struct Brightness {
-    offset: f64,
-    gain: f64,
-}
-
-/// Normal equations over the window: `N` slopes, deformations if asked for, the slope of light in u
-/// and v, value, one, and the grey value last.
-struct Sums {
-    matrix: DMatrix<f64>,
-    saturated: f64,
-    counted: f64,
-}
-
-/// Pixels of the window around the centre, if it lies inside the image.
-fn window_of<const N: usize>(
-    image: &Image8,
-    model: &impl PixelModel<N>,
-    p: &[f64; N],
-) -> Result<[std::ops::RangeInclusive<usize>; 2], NoFinding> {
-    let reach = model.reach(p);
-    let fits = |x: f64, size: u32| x - reach >= 0.0 && x + reach <= f64::from(size) - 1.0;
-    if !(fits(p[0], image.width_px) && fits(p[1], image.height_px)) {
-        return Err(NoFinding::OutsideImage {
-            u_px: p[0],
-            v_px: p[1],
-        });
-    }
-    let range = |x: f64| (x - reach).ceil() as usize..=(x + reach).floor() as usize;
-    Ok([range(p[0]), range(p[1])])
-}
-
-/// One pixel's column of the design matrix without the grey value; its weight.
-fn design<const N: usize>(
-    model: &impl PixelModel<N>,
-    p: &[f64; N],
-    light: Brightness,
-    deformations: usize,
-    (u, v): (usize, usize),
-    column: &mut [f64],
-) -> f64 {
-    let (u, v) = (u as f64, v as f64);
-    let mut slopes = [0.0; N];
-    let (value, weight) = model.at(p, u, v, &mut slopes);
-    if !(weight > 0.0) {
-        return 0.0;
-    }
-    column[..N].copy_from_slice(&slopes);
-    let k = N + deformations;
-    if deformations > 0 {
-        column[N..k].fill(0.0);
-        model.deform(p, u, v, &mut column[N..k]);
-    }
-    let brightness = light.offset + light.gain * value;
-    column[k] = (u - p[0]) * brightness;
-    column[k + 1] = (v - p[1]) * brightness;
-    column[k + 2] = value;
-    column[k + 3] = 1.0;
-    weight
-}
-
-fn accumulate<const N: usize>(
-    image: &Image8,
-    model: &impl PixelModel<N>,
-    p: &[f64; N],
-    light: Brightness,
-    deformations: usize,
-) -> Result<Sums, NoFinding> {
-    let [columns, rows] = window_of(image, model, p)?;
-    let size = N + deformations + LINEAR;
-    let mut sums = vec![0.0; (size + 1) * (size + 1)];
-    let mut column = vec![0.0; size + 1];
-    let (mut saturated, mut counted) = (0.0, 0.0);
-    for v in rows {
-        let row = &image.pixels[v * image.width_px as usize..][..image.width_px as usize];
-        for u in columns.clone() {
-            let weight = design(model, p, light, deformations, (u, v), &mut column[..size]);
-            if weight == 0.0 {
-                continue;
-            }
-            counted += 1.0;
-            saturated += f64::from(u8::from(row[u] >= SATURATION_DN));
-            column[size] = f64::from(row[u]);
-            // the lower triangle, column by column
-            let mut start = 0;
-            for (i, &x) in column.iter().enumerate() {
-                let weighted = weight * x;
-                let end = start + size + 1;
-                for (m, &y) in sums[start + i..end].iter_mut().zip(&column[i..]) {
-                    *m += weighted * y;
-                }
-                start = end;
-            }
-        }
-    }
-    let mut matrix = DMatrix::from_vec(size + 1, size + 1, sums);
-    matrix.fill_upper_triangle_with_lower_triangle();
-    Ok(Sums {
-        matrix,
-        saturated: saturated / f64::max(counted, 1.0),
-        counted,
-    })
-}
 
 /// Adds the least that keeps a parameter without influence from making the equations singular.
 fn hold(normal: &mut DMatrix<f64>, parameters: usize) {

@@ -109,13 +109,29 @@ struct Crossing {
 const MIN_BLUR_PX: f64 = 0.3;
 
 /// One blurred edge at a pixel: 2 Phi(z) - 1, z being the distance in blurs, with phi(z) and the
-/// derivatives of z by u, v, turn and blur.
+/// distance along the edge in blurs.
 struct Edge {
-    n: [f64; 2],
     z: f64,
     value: f64,
     density: f64,
-    by: [f64; 4],
+    along: f64,
+}
+
+/// One of the edges, for all pixels.
+struct Line {
+    n: [f64; 2],
+    /// 1 / (1 + t^2): change of the direction with the tangent t of its turn.
+    by_tangent: f64,
+}
+
+/// The crossing, for all pixels.
+struct Lines {
+    centre: [f64; 2],
+    over_blur: f64,
+    lines: [Line; 2],
+    /// c = n1.n2, c^2 / 2 and c^3 / 6.
+    cosine: [f64; 3],
+    sine: f64,
 }
 
 /// What a blurred crossing has beside the product of its blurred edges unless they are at right
@@ -131,18 +147,17 @@ struct Skew {
 }
 
 impl Skew {
-    fn of(a: &Edge, b: &Edge) -> Self {
-        let c = a.n[0] * b.n[0] + a.n[1] * b.n[1];
+    #[inline(always)]
+    fn of(a: &Edge, b: &Edge, [c, c2, c3]: [f64; 3]) -> Self {
         let density = 4.0 * a.density * b.density;
         let (x, y) = (a.z, b.z);
         let (xx, yy) = (x * x - 1.0, y * y - 1.0);
-        let (c2, c3) = (0.5 * c * c, c * c * c / 6.0);
         let sum = c + c2 * x * y + c3 * xx * yy;
         Self {
             value: density * sum,
             by_a: density * (c2 * y + c3 * 2.0 * x * yy - x * sum),
             by_b: density * (c2 * x + c3 * 2.0 * y * xx - y * sum),
-            by_cosine: density * (1.0 + c * x * y + 0.5 * c * c * xx * yy),
+            by_cosine: density * (1.0 + c * x * y + c2 * xx * yy),
         }
     }
 }
@@ -158,40 +173,59 @@ impl Crossing {
 }
 
 impl PixelModel<5> for Crossing {
-    fn at(&self, p: &[f64; 5], u: f64, v: f64, slopes: &mut [f64; 5]) -> (f64, f64) {
-        let (du, dv) = (u - p[0], v - p[1]);
-        let weight = (self.window_px + 0.5 - (du * du + dv * dv).sqrt()).clamp(0.0, 1.0);
-        if weight <= 0.0 {
+    type Shared = Lines;
+
+    fn shared(&self, p: &[f64; 5]) -> Lines {
+        let lines = [0, 1].map(|k| Line {
+            n: self.turned(k, p[2 + k]),
+            by_tangent: 1.0 / (1.0 + p[2 + k] * p[2 + k]),
+        });
+        let (a, b) = (lines[0].n, lines[1].n);
+        let c = a[0] * b[0] + a[1] * b[1];
+        Lines {
+            centre: [p[0], p[1]],
+            over_blur: 1.0 / p[4],
+            lines,
+            cosine: [c, 0.5 * c * c, c * c * c / 6.0],
+            sine: a[0] * b[1] - a[1] * b[0],
+        }
+    }
+
+    #[inline(always)]
+    fn at(&self, shared: &Lines, u: f64, v: f64, slopes: &mut [f64; 5]) -> (f64, f64) {
+        let (du, dv) = (u - shared.centre[0], v - shared.centre[1]);
+        let square = du * du + dv * dv;
+        let reach = self.window_px + 0.5;
+        if square >= reach * reach {
             return (0.0, 0.0);
         }
-        let edge = |which: usize, t: f64| {
-            let n = self.turned(which, t);
-            let z = (n[0] * du + n[1] * dv) / p[4];
+        let weight = (reach - square.sqrt()).clamp(0.0, 1.0);
+        let over = shared.over_blur;
+        let edge = |n: [f64; 2]| {
+            let z = (n[0] * du + n[1] * dv) * over;
             let (below, density) = normal_at(z as f32);
-            // change of z with the centre and with the turn
-            let turn = (-n[1] * du + n[0] * dv) / (1.0 + t * t) / p[4];
             Edge {
-                n,
                 z,
                 value: 2.0 * f64::from(below) - 1.0,
                 density: f64::from(density),
-                by: [-n[0] / p[4], -n[1] / p[4], turn, -z / p[4]],
+                along: (-n[1] * du + n[0] * dv) * over,
             }
         };
-        let (a, b) = (edge(0, p[2]), edge(1, p[3]));
-        let skew = Skew::of(&a, &b);
+        let [first, second] = &shared.lines;
+        let (a, b) = (edge(first.n), edge(second.n));
+        let skew = Skew::of(&a, &b, shared.cosine);
         let (by_a, by_b) = (
             2.0 * a.density * b.value + skew.by_a,
             2.0 * b.density * a.value + skew.by_b,
         );
         // turning a normal changes the cosine of both by the sine between them
-        let sine = a.n[0] * b.n[1] - a.n[1] * b.n[0];
+        let by_turn = skew.by_cosine * shared.sine;
         *slopes = [
-            by_a * a.by[0] + by_b * b.by[0],
-            by_a * a.by[1] + by_b * b.by[1],
-            by_a * a.by[2] + skew.by_cosine * sine / (1.0 + p[2] * p[2]),
-            by_b * b.by[2] - skew.by_cosine * sine / (1.0 + p[3] * p[3]),
-            by_a * a.by[3] + by_b * b.by[3],
+            -(by_a * first.n[0] + by_b * second.n[0]) * over,
+            -(by_a * first.n[1] + by_b * second.n[1]) * over,
+            (by_a * a.along + by_turn) * first.by_tangent,
+            (by_b * b.along - by_turn) * second.by_tangent,
+            -(by_a * a.z + by_b * b.z) * over,
         ];
         (a.value * b.value + skew.value, weight)
     }
