@@ -4,7 +4,7 @@
 use nalgebra::{Matrix2, Vector2};
 
 use super::align::refine;
-use super::model::{self, LocalMap, Part, Picture};
+use super::model::{self, LocalMap, Part, Picture, level_sigma};
 use super::{NotFound, PlateSearch};
 use crate::image::Image8;
 use crate::ncc::{ScoreMap, SearchImage, Template, score_map};
@@ -23,8 +23,6 @@ const MIN_COARSE_SIDE: f64 = 12.0;
 const MIN_COARSE_MARK: f64 = 0.9;
 /// Coarsest level: quarter resolution.
 const MAX_LEVEL: u32 = 2;
-/// Variance of the box that makes one pixel of unit side, px^2.
-const BOX_VARIANCE: f64 = 1.0 / 12.0;
 
 /// Smallest half size of the searched part's marks, m.
 fn smallest_mark_m(search: &PlateSearch, part: Part) -> f64 {
@@ -483,9 +481,16 @@ impl Pattern {
     }
 }
 
-/// Blur of an image reduced `level` times, in full-resolution px.
-pub(super) fn level_sigma(sigma_px: f64, level: u32) -> f64 {
-    let step = f64::from(1u32 << level);
-    // the full-resolution blur already holds one pixel's box
-    (sigma_px * sigma_px + (step * step - 1.0) * BOX_VARIANCE).sqrt()
+/// What a glance and the full search say about a saddle.
+#[cfg(test)]
+pub(super) fn both_ways(
+    image: &Image8,
+    search: &PlateSearch,
+    map: &LocalMap,
+) -> Option<(Vec<Candidate>, Vec<Candidate>)> {
+    let field = Field::new(image, search, map, Part::Saddle).ok()?;
+    Some((
+        glance(&field, map),
+        correlate(&field, &field.window(), map)?,
+    ))
 }

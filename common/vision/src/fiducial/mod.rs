@@ -191,10 +191,12 @@ pub fn find_plate(image: &Image8, search: &PlateSearch) -> Result<PlateObservati
 /// [`NotFound`] with the reason and the numbers behind it.
 pub fn find_saddle(image: &Image8, search: &PlateSearch) -> Result<PointObservation, NotFound> {
     let saddle = search.layout.saddle.as_ref().ok_or(NotFound::NoSaddle)?;
-    prepare(image, search)?;
+    let mut map = prepare(image, search)?;
     let centre = Vector3::new(saddle.x_m, saddle.y_m, 0.0);
-    let pose = &search.predicted_camera_frame_from_plate;
-    let map = model::LocalMap::new(search.camera, pose, &centre)?;
+    if centre != Vector3::zeros() {
+        let pose = &search.predicted_camera_frame_from_plate;
+        map = model::LocalMap::new(search.camera, pose, &centre)?;
+    }
     locate::locate(image, search, &map, model::Part::Saddle, &|candidate| {
         points::measure_saddle(image, search, candidate)
     })

@@ -165,6 +165,16 @@ pub(super) fn bounds(
     (low, high)
 }
 
+/// Variance of the box that makes one pixel of unit side, px^2.
+const BOX_VARIANCE: f64 = 1.0 / 12.0;
+
+/// Blur of an image reduced `level` times, in full-resolution px.
+pub(super) fn level_sigma(sigma_px: f64, level: u32) -> f64 {
+    let step = f64::from(1u32 << level);
+    // the full-resolution blur already holds one pixel's box
+    (sigma_px * sigma_px + (step * step - 1.0) * BOX_VARIANCE).sqrt()
+}
+
 /// Draws a part, with its derivatives if `slopes`. The grid starts at `origin_px`; `sigma_px` is the
 /// blur in image px. `None` if the map is degenerate.
 #[allow(clippy::too_many_arguments)] // what a picture is made of

@@ -413,3 +413,31 @@ fn the_result_does_not_depend_on_how_often_it_is_computed() {
         find_plate(&image, &search).unwrap()
     );
 }
+
+#[test]
+fn a_glance_gives_the_place_and_score_of_the_full_search() {
+    let rig = Rig::new();
+    let mut rng = synthetic::rng(31);
+    let mut told = 0;
+    for case in 0..6 {
+        let pixel = Vector2::new(280.0 + 11.3 * case as f64, 230.0 - 6.7 * case as f64);
+        let tilt = 0.1 * case as f64;
+        let pose = synthetic::facing_pose(&rig.pair.left, pixel, 0.6, tilt, 1.0, 0.3);
+        let image = rig.image(&rig.picture(0, &pose, 40 + case), 1.5, &mut rng);
+        let search = rig.search(0, Translation3::new(0.004, -0.003, 0.0) * pose, 16.0);
+        let map = model::LocalMap::new(
+            search.camera,
+            &(Translation3::new(0.004, -0.003, 0.0) * pose),
+            &Vector3::zeros(),
+        )
+        .unwrap();
+        let (glance, full) = locate::both_ways(&image, &search, &map).unwrap();
+        let Some(glance) = glance.first() else {
+            continue;
+        };
+        assert_eq!(glance.score, full[0].score, "{case}");
+        assert_eq!(glance.map.pixel_px, full[0].map.pixel_px, "{case}");
+        told += 1;
+    }
+    assert!(told >= 5, "{told}");
+}

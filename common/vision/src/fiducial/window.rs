@@ -71,7 +71,12 @@ impl Window {
     #[inline(always)]
     fn accumulate_plain<const BLUR: bool>(&self, image: &Image8) -> (Sums, f64) {
         let width = image.width_px as usize;
-        let (centre, reach) = (self.centre, self.reach_px);
+        // no pixel further away counts
+        let reach = match self.kind {
+            PointKind::Disc => self.reach_px,
+            PointKind::Saddle => self.reach_px.min(f64::from(self.radius_px)),
+        };
+        let centre = self.centre;
         let (top, bottom) = (
             (centre.y - reach).ceil() as usize,
             (centre.y + reach) as usize,
@@ -82,7 +87,6 @@ impl Window {
             let mut rows = [[0.0f32; LANES]; 21];
             for v in first_row..=bottom.min(first_row + ROWS_AT_ONCE - 1) {
                 let offset = v as f64 - centre.y;
-                // no pixel further away than the reach counts
                 let half = (reach * reach - offset * offset).max(0.0).sqrt();
                 let (first, last) = (
                     (centre.x - half).ceil() as usize,
@@ -195,5 +199,102 @@ impl EdgeDistance {
             self.half[i] - x.abs()
         };
         each(|k| smaller(axis(0, k), axis(1, k)) - EDGE_STRIP_PX as f32)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, clippy::expect_used)]
+    use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+
+    use super::*;
+    use crate::plate::PlateLayout;
+
+    fn maps() -> Vec<(PlateLayout, usize, LocalMap)> {
+        let camera = &crate::synthetic::pair().left;
+        let layout = PlateLayout::standard(0.08);
+        let turn = |angle: f64| UnitQuaternion::from_scaled_axis(Vector3::new(0.3, angle, 0.2));
+        let facing =
+            crate::synthetic::facing_pose(camera, Vector2::new(310.0, 240.0), 0.5, 0.0, 0.0, 0.4);
+        let mut all = Vec::new();
+        for (index, angle) in [(0, 0.0), (4, 0.5), (11, 0.0), (11, -0.6)] {
+            let pose = facing * Isometry3::from_parts(Translation3::identity(), turn(angle));
+            let at = layout.point(index).unwrap();
+            let map = LocalMap::new(camera, &pose, &at).unwrap();
+            all.push((layout.clone(), index, map));
+        }
+        all
+    }
+
+    fn model(layout: &PlateLayout, index: usize, map: &LocalMap, blur_px: f64) -> MarkModel {
+        match layout.discs.get(index) {
+            Some(disc) => MarkModel::disc(map, disc, blur_px),
+            None => MarkModel::saddle(map, layout.saddle.as_ref().unwrap(), blur_px),
+        }
+    }
+
+    #[test]
+    fn derivatives_of_the_darkness_are_its_differences() {
+        for (layout, index, map) in maps() {
+            let value = |du: f32, dv: f32, blur_px: f64| {
+                model(&layout, index, &map, blur_px).at(&[du; LANES], dv)
+            };
+            let h = 0.02f32;
+            let mut changes = 0;
+            for k in 0..400 {
+                let du = -9.0 + 18.0 * (k as f32 * 0.618_034).fract();
+                let dv = -9.0 + 18.0 * (k as f32 * 0.414_214).fract();
+                let d = value(du, dv, 0.8);
+                let slope = |a: &Lane, b: &Lane| (a[3] - b[3]) / (2.0 * h);
+                let by_u = slope(&value(du + h, dv, 0.8).value, &value(du - h, dv, 0.8).value);
+                let by_v = slope(&value(du, dv + h, 0.8).value, &value(du, dv - h, 0.8).value);
+                let step = f64::from(h);
+                let blurs = [0.8 + step, 0.8 - step].map(|blur| value(du, dv, blur).value);
+                let by_blur = slope(&blurs[0], &blurs[1]);
+                // to first order in the curvature of the outline
+                for (name, got, expected) in [
+                    ("u", d.du[3], by_u),
+                    ("v", d.dv[3], by_v),
+                    ("blur", d.dsigma[3], by_blur),
+                ] {
+                    let off = (got - expected).abs();
+                    assert!(
+                        off < 0.06,
+                        "{index} {name} at ({du}, {dv}): {got} {expected}"
+                    );
+                }
+                changes += usize::from(by_u.abs() > 0.1);
+            }
+            assert!(changes > 20, "{index}: {changes}");
+        }
+    }
+
+    #[test]
+    fn the_sums_do_not_depend_on_the_vector_unit() {
+        let pixels = (0..640 * 480).map(|i| (i * 7 % 251) as u8).collect();
+        let image = Image8::from_raw(640, 480, pixels).unwrap();
+        for (layout, index, map) in maps() {
+            let mark = Mark::new(&layout, index).unwrap();
+            let window = Window {
+                model: model(&layout, index, &map, 0.7),
+                edge: EdgeDistance::new(&mark, &map),
+                kind: if index == 11 {
+                    PointKind::Saddle
+                } else {
+                    PointKind::Disc
+                },
+                centre: map.pixel_px + Vector2::new(0.3, -0.2),
+                reach_px: 10.0,
+                margin_px: 3.0,
+                rim_px: 1.0,
+                radius_px: 9.5,
+                saturation_dn: 240.0 - MIDDLE_DN,
+            };
+            let (sums, saturated) = window.accumulate(&image, true);
+            assert_eq!((sums, saturated), window.accumulate_plain::<true>(&image));
+            assert!(sums[9] > 20.0 && saturated > 0.0, "{sums:?}");
+            let (known_blur, _) = window.accumulate(&image, false);
+            assert_eq!(sums[..15], known_blur[..15]);
+        }
     }
 }

@@ -378,3 +378,22 @@ pub(super) fn outlines(
     };
     all.into_iter().map(outline).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bit_tells_which_pixels_of_a_tile_are_beyond_the_limit() {
+        let pixels = [10u8, 200, 99, 100, 101, 0, 255, 100];
+        for length in [8, 5, 1] {
+            for dark in [true, false] {
+                let bits = beyond_limit(&pixels[..length], 100, dark);
+                for k in 0..8 {
+                    let expected = k < length && (pixels[k] < 100) == dark;
+                    assert_eq!(bits >> k & 1 == 1, expected, "{length} {dark} {k}");
+                }
+            }
+        }
+    }
+}

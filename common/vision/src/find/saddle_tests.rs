@@ -32,7 +32,7 @@ fn the_model_is_the_blurred_crossing_at_any_angle() {
             sum += weight * sign;
             weights += weight;
         }
-        let (value, _) = model.at(&AT, u, v, &mut [0.0; 5]);
+        let (value, _) = model.at(&model.shared(&AT), u, v, &mut [0.0; 5]);
         let expected = sum / weights;
         assert!(
             (value - expected).abs() < 5e-3,
@@ -47,12 +47,12 @@ fn the_models_slopes_are_its_differences() {
     for k in 0..81 {
         let (u, v) = (16.0 + f64::from(k % 9), 16.0 + f64::from(k / 9));
         let mut slopes = [0.0; 5];
-        model.at(&AT, u, v, &mut slopes);
+        model.at(&model.shared(&AT), u, v, &mut slopes);
         for (i, slope) in slopes.iter().enumerate() {
             let moved = |h: f64| {
                 let mut p = AT;
                 p[i] += h;
-                model.at(&p, u, v, &mut [0.0; 5]).0
+                model.at(&model.shared(&p), u, v, &mut [0.0; 5]).0
             };
             // the model grows by p where the image would: its slopes are those of the parameters
             let difference = (moved(0.01) - moved(-0.01)) / 0.02;

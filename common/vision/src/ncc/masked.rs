@@ -11,7 +11,7 @@ const FEW: usize = 12;
 
 /// Whether this is the way for a template over so many positions.
 pub(super) fn is_for(template: &Template, extent: &Extent) -> bool {
-    !template.rectangular
+    !template.mask.is_empty()
         && extent.width <= FEW
         && template.count as i64 * VALUE_LIMIT * VALUE_LIMIT <= i64::from(i32::MAX)
 }

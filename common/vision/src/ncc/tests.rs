@@ -73,6 +73,30 @@ fn scores_equal_the_definition_with_and_without_a_mask() {
 }
 
 #[test]
+fn a_masked_template_scores_the_same_at_few_positions_and_at_many() {
+    let image = noise(60, 50, 5);
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
+    let search = SearchImage::whole(&image, 0);
+    for (w, h) in [(5, 7), (16, 9), (21, 22)] {
+        let values: Vec<f32> = (0..w * h).map(|_| rng.random_range(-1.0..0.0)).collect();
+        let mask: Vec<bool> = (0..w * h).map(|_| rng.random_bool(0.7)).collect();
+        let template = Template::new(w, h, &values, Some(&mask)).unwrap();
+        let many = score_map(&search, &template, 0, 0, 100, 100).unwrap();
+        assert!(many.width > 12);
+        for (left, top) in [(0, 0), (3, 4), (many.width - 3, many.height - 3)] {
+            let few = score_map(&search, &template, left, top, 3, 3).unwrap();
+            for (i, j) in (0..9).map(|k| (k % 3, k / 3)) {
+                assert_eq!(
+                    few.at(i, j),
+                    many.at(left + i, top + j),
+                    "{w} {left} {i} {j}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
 fn reduced_search_images_hold_means() {
     let image = noise(37, 29, 3);
     for level in 1..=3u32 {
