@@ -13,6 +13,7 @@
 //! and by a fit with its worst error where they are not.
 
 pub mod conversion;
+mod fit;
 pub mod kalibr;
 mod lens;
 pub mod opencv;

@@ -3,8 +3,10 @@
 
 mod cahvore;
 mod calibration;
+mod calibration_quality;
 mod common;
 mod conversion;
+mod conversion_fit;
 mod formats;
 mod models;
 mod reference;
