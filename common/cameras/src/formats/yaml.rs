@@ -6,7 +6,8 @@ use serde::de::DeserializeOwned;
 /// Deepest nesting that is read; the deepest of the formats has five levels.
 const MAX_DEPTH: usize = 12;
 
-/// Reads one YAML document. Aliases, which can make a short text long, are refused.
+/// Reads one YAML document; a mark that ends it (`---` as `ros2 topic echo` prints it, or `...`) may
+/// follow. Aliases, which can make a short text long, are refused.
 pub(super) fn read<T: DeserializeOwned>(text: &str) -> Result<T, FormatError> {
     if text.len() > MAX_BYTES {
         return Err(FormatError::TooLong { found: text.len() });
@@ -21,12 +22,22 @@ pub(super) fn read<T: DeserializeOwned>(text: &str) -> Result<T, FormatError> {
             max_documents: 1,
         },
     };
-    serde_saphyr::from_str_with_options(text, options).map_err(|error| {
+    serde_saphyr::from_str_with_options(without_mark(text), options).map_err(|error| {
         let bare = error.without_snippet();
         FormatError::Structure {
             message: brief(&bare.to_string()),
         }
     })
+}
+
+/// The text without a last line that only ends the document.
+fn without_mark(text: &str) -> &str {
+    let end = text.trim_end();
+    ["---", "..."]
+        .iter()
+        .filter_map(|mark| end.strip_suffix(mark))
+        .find(|rest| rest.ends_with('\n'))
+        .unwrap_or(text)
 }
 
 /// A number as YAML 1.1 and 1.2 both read it: with a point, and a sign in the exponent.
@@ -64,5 +75,15 @@ pub(super) fn wrong(
         field: field.to_owned(),
         found: super::shown(&found.to_string()),
         expected: expected.into(),
+    }
+}
+
+/// `4, 5 or 8 numbers`.
+pub(super) fn counts(counts: &[usize]) -> String {
+    let words: Vec<String> = counts.iter().map(ToString::to_string).collect();
+    match words.split_last() {
+        Some((last, [])) => format!("{last} numbers"),
+        Some((last, rest)) => format!("{} or {last} numbers", rest.join(", ")),
+        None => "no numbers".into(),
     }
 }

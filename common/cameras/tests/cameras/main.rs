@@ -7,6 +7,7 @@ mod calibration_quality;
 mod common;
 mod conversion;
 mod conversion_fit;
+mod foreign_files;
 mod formats;
 mod models;
 mod reference;
