@@ -28,11 +28,20 @@ fn an_opencv_lens_named_in_words_is_that_lens() {
         ("", by_tangent),
         ("fisheye_model: 1\n", by_angle),
         ("distortion_model: equidistant\n", by_angle),
-        ("distortion_model: \"fisheye\"\nfisheye_model: 1\n", by_angle),
+        (
+            "distortion_model: \"fisheye\"\nfisheye_model: 1\n",
+            by_angle,
+        ),
         ("camera_model: fisheye\n", by_angle),
-        ("camera_model: pinhole\ndistortion_model: equidistant\n", by_angle),
+        (
+            "camera_model: pinhole\ndistortion_model: equidistant\n",
+            by_angle,
+        ),
         ("distortion_model: plumb_bob\n", by_tangent),
-        ("distortion_model: radtan\ncamera_model: pinhole\n", by_tangent),
+        (
+            "distortion_model: radtan\ncamera_model: pinhole\n",
+            by_tangent,
+        ),
     ] {
         let camera = opencv::read(&fisheye(extra)).unwrap();
         let error = camera.project(&point).unwrap() - expected;
@@ -55,8 +64,14 @@ fn an_opencv_name_that_changes_the_meaning_is_refused() {
     for (extra, field) in [
         ("distortion_model: division\n", "distortion_model"),
         ("camera_model: omnidirectional\n", "camera_model"),
-        ("distortion_model: plumb_bob\nfisheye_model: 1\n", "distortion_model"),
-        ("distortion_model: equidistant\nfisheye_model: 0\n", "distortion_model"),
+        (
+            "distortion_model: plumb_bob\nfisheye_model: 1\n",
+            "distortion_model",
+        ),
+        (
+            "distortion_model: equidistant\nfisheye_model: 0\n",
+            "distortion_model",
+        ),
         ("fisheye_model: 2\n", "fisheye_model"),
         ("xi: 1.2\n", "xi"),
         ("alpha: 0.1\n", "skew"),
@@ -170,17 +185,18 @@ fn a_rectified_pair_gives_the_pose_of_its_right_camera() {
     // Turned by 0.1 rad about y, 0.08 m to the right.
     let turn = "0.99500416527802576, 0, 0.099833416646828155, 0, 1, 0, \
                 -0.099833416646828155, 0, 0.99500416527802576";
-    let info = ros::read(&ros_file(turn, "480, 0, 310, -38.4, 0, 480, 241, 0, 0, 0, 1, 0")).unwrap();
+    let info = ros::read(&ros_file(
+        turn,
+        "480, 0, 310, -38.4, 0, 480, 241, 0, 0, 0, 1, 0",
+    ))
+    .unwrap();
     assert!(info.posed);
     // The rectified pixel by P is that of the true direction: X_rectified = R X_own + B.
     let point = Vector3::new(0.2, -0.1, 1.5);
     let (sine, cosine) = 0.1_f64.sin_cos();
     let d = point - Vector3::new(0.08, 0.0, 0.0);
     let own = Vector3::new(cosine * d.x - sine * d.z, d.y, sine * d.x + cosine * d.z);
-    let expected = Vector2::new(
-        500.0 * own.x / own.z + 320.0,
-        500.0 * own.y / own.z + 240.0,
-    );
+    let expected = Vector2::new(500.0 * own.x / own.z + 320.0, 500.0 * own.y / own.z + 240.0);
     let error = info.camera.project(&point).unwrap() - expected;
     assert!(error.amax() < 1e-9, "{error}");
 }
@@ -190,15 +206,26 @@ fn a_camera_without_rectification_stays_in_its_own_axes() {
     let one = "1, 0, 0, 0, 1, 0, 0, 0, 1";
     for (r, p) in [
         (one, "480, 0, 310, 0, 0, 480, 241, 0, 0, 0, 1, 0"),
-        ("0, 0, 0, 0, 0, 0, 0, 0, 0", "0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0"),
+        (
+            "0, 0, 0, 0, 0, 0, 0, 0, 0",
+            "0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0",
+        ),
     ] {
         let info = ros::read(&ros_file(r, p)).unwrap();
         assert!(!info.posed);
         assert_eq!(info.camera.frame_from_camera, Isometry3::identity());
     }
     for (r, p, field) in [
-        ("1, 0, 0, 0, 1, 0, 0, 0, 2", "1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0", "rectification_matrix"),
-        (one, "0, 0, 310, -38, 0, 480, 241, 0, 0, 0, 1, 0", "projection_matrix"),
+        (
+            "1, 0, 0, 0, 1, 0, 0, 0, 2",
+            "1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0",
+            "rectification_matrix",
+        ),
+        (
+            one,
+            "0, 0, 310, -38, 0, 480, 241, 0, 0, 0, 1, 0",
+            "projection_matrix",
+        ),
     ] {
         assert_eq!(field_of(ros::read(&ros_file(r, p)).unwrap_err()), field);
     }
@@ -223,7 +250,10 @@ fn a_matrix_that_is_none_is_named_by_its_line() {
     for (from, to) in [
         ("[0, 0, 0, 0, 0]", "none"),
         ("[0, 0, 0, 0, 0]", "[0, 0, a, 0, 0]"),
-        ("[0, 0, 0, 0, 0]", "{rows: 1, columns: 5, data: [0, 0, 0, 0, 0]}"),
+        (
+            "[0, 0, 0, 0, 0]",
+            "{rows: 1, columns: 5, data: [0, 0, 0, 0, 0]}",
+        ),
     ] {
         let message = ros::read(&text.replace(from, to)).unwrap_err().to_string();
         println!("{message}");
