@@ -34,7 +34,7 @@ use adjust::Adjustment;
 use nalgebra::{DMatrix, Isometry3, Vector2};
 pub use quality::{
     CELLS, MAX_PICTURE_REJECTED, PictureFit, QualityLimits, QualityProblem, SAME_PLACEMENT_PX,
-    STRUCTURED_SHARE, repeats,
+    STRUCTURED_PX, STRUCTURED_SHARE, repeats,
 };
 use quality::{check_pairs, side};
 use rig::Rig;
@@ -164,7 +164,7 @@ pub enum CalibrationError {
     },
     /// Too little is left of what was seen.
     #[error(
-        "{} of {views} placements of the board do not fit the others; {left} are left to the {} \
+        "{} of {views} placements of the board do not fit the others, leaving {left} to the {} \
          camera, expected at least {expected}",
         dropped.len(), side(*camera)
     )]

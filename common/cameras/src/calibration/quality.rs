@@ -16,6 +16,9 @@ pub const CELLS: [usize; 2] = [8, 6];
 /// Share of the squared error that neighbouring corners have in common from which the model is
 /// said to leave distortion over; noise alone gives 0 ([`Calibration::structured_share`]).
 pub const STRUCTURED_SHARE: f64 = 0.4;
+/// Least root mean square of that common part, px: printed boards are not flat, and corners of one
+/// picture are blurred alike, to about 0.1 px.
+pub const STRUCTURED_PX: f64 = 0.2;
 
 /// The limits of a calibration that is good enough to be used.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -264,8 +267,7 @@ impl Calibration {
     }
 
     /// Share of a camera's squared error that a corner has in common with the nearest corner of the
-    /// same picture: 0 for noise, near 1 for errors that vary smoothly; from
-    /// [`STRUCTURED_SHARE`] on the model leaves distortion over, or the board is not flat.
+    /// same picture: 0 for noise, near 1 for errors that vary smoothly.
     pub fn structured_share(&self, camera: usize) -> f64 {
         let own = |r: &&super::Residual| r.camera == camera && r.used;
         let used: Vec<_> = self.residuals.iter().filter(own).collect();
@@ -285,6 +287,15 @@ impl Calibration {
         } else {
             0.0
         }
+    }
+
+    /// The root mean square of the errors that neighbouring corners have in common, px, if it is so
+    /// much ([`STRUCTURED_SHARE`], [`STRUCTURED_PX`]) that the model leaves distortion over, or
+    /// the board is not flat.
+    pub fn left_over_px(&self, camera: usize) -> Option<f64> {
+        let share = self.structured_share(camera);
+        let common_px = share.sqrt() * self.rms_px.get(camera)?;
+        (share >= STRUCTURED_SHARE && common_px >= STRUCTURED_PX).then_some(common_px)
     }
 
     /// The limits that this calibration does not keep; none for one to be used.

@@ -109,6 +109,8 @@ fn distortion_that_a_model_leaves_over_shows() {
         println!("{good} {bad} of {} px", poor.rms_px[camera]);
         assert!(good < 0.1, "{good}");
         assert!(bad > STRUCTURED_SHARE, "{bad}");
+        assert_eq!(right.left_over_px(camera), None);
+        assert!(poor.left_over_px(camera).is_some());
     }
 }
 

@@ -46,6 +46,7 @@ pub(super) fn account(
         "corners": found.residuals.len(),
         "rejected": found.rejected,
         "views_left_out": found.dropped,
+        "left_over_px": by_side(&|n| json!(found.left_over_px(n))),
         "structured_share": by_side(&|n| json!(found.structured_share(n))),
         "baseline_m": found.baseline_m().map(|b| json!({ "value": b.value, "sigma": b.sigma })),
         "parameters": found.parameters.iter().map(|p| json!({
@@ -135,13 +136,11 @@ pub(super) fn summary(found: &Calibration) -> String {
 
 /// A word on errors that have a pattern.
 pub(super) fn pattern(found: &Calibration, camera: usize, more: &str) -> Option<String> {
-    let share = found.structured_share(camera);
-    (share >= STRUCTURED_SHARE).then(|| {
+    found.left_over_px(camera).map(|px| {
         format!(
-            "{}: neighbouring corners have {:.0} % of their squared error in common: distortion is left \
-             over (or the board is not flat); {more}",
-            SIDES[camera],
-            100.0 * share
+            "{}: {px:.2} px rms of the error is common to neighbouring corners: distortion is left over \
+             (or the board is not flat); {more}",
+            SIDES[camera]
         )
     })
 }
