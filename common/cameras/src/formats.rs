@@ -16,6 +16,7 @@ pub mod conversion;
 mod fit;
 pub mod kalibr;
 mod lens;
+mod lens_fit;
 pub mod opencv;
 mod pose;
 pub mod ros;

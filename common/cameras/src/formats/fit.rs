@@ -8,7 +8,9 @@
 
 use crate::least_squares::{Differenced, Normal, Problem, minimise};
 use crate::{CameraError, Ray};
-use nalgebra::{DMatrix, DVector, Matrix2, Vector2, Vector3};
+use nalgebra::{
+    DMatrix, DVector, Isometry3, Matrix2, Translation3, UnitQuaternion, Vector2, Vector3,
+};
 
 const ITERATIONS: u32 = 200;
 /// Iterations at each power.
@@ -87,6 +89,16 @@ pub(super) fn back_px(
         }
     }
     worst
+}
+
+/// A pose turned and moved by six small numbers: angles (radians), then metres.
+pub(super) fn nudged(pose: &Isometry3<f64>, by: &[f64]) -> Isometry3<f64> {
+    let turn = UnitQuaternion::from_scaled_axis(Vector3::new(by[0], by[1], by[2]));
+    let shift = Vector3::new(by[3], by[4], by[5]);
+    Isometry3::from_parts(
+        Translation3::from(pose.translation.vector + shift),
+        pose.rotation * turn,
+    )
 }
 
 /// A camera with parameters to be fitted.

@@ -271,7 +271,8 @@ fn pose(file: &File) -> Result<Option<Isometry3<f64>>, FormatError> {
                 "[fx, 0, cx, -fx Bx, 0, fy, cy, -fy By, 0, 0, 1, 0]",
             ));
         }
-        shift = Translation3::new(-p[3] / p[0], -p[7] / p[5], 0.0);
+        // Without the sign of a zero.
+        shift = Translation3::new(0.0 - p[3] / p[0], 0.0 - p[7] / p[5], 0.0);
     }
     // Rectification that does nothing is written to seven digits or more.
     let own = turn.angle() < 1e-9 && shift.vector.amax() == 0.0;

@@ -1,6 +1,6 @@
 //! Bounded reading of YAML, and numbers that every YAML reader takes for numbers.
 
-use super::{FormatError, MAX_BYTES, brief};
+use super::{FormatError, MAX_BYTES, brief, shown};
 use serde::de::DeserializeOwned;
 
 /// Deepest nesting that is read; the deepest of the formats has five levels.
@@ -23,11 +23,20 @@ pub(super) fn read<T: DeserializeOwned>(text: &str) -> Result<T, FormatError> {
         },
     };
     serde_saphyr::from_str_with_options(without_mark(text), options).map_err(|error| {
-        let bare = error.without_snippet();
-        FormatError::Structure {
-            message: brief(&bare.to_string()),
-        }
+        let message = brief(&error.without_snippet().to_string());
+        let message = match line_of(&message).and_then(|n| text.lines().nth(n.checked_sub(1)?)) {
+            Some(line) => format!("{message}: `{}`", shown(&brief(line))),
+            None => message,
+        };
+        FormatError::Structure { message }
     })
+}
+
+/// The line that a message of the reader names, from 1.
+fn line_of(message: &str) -> Option<usize> {
+    let (_, rest) = message.rsplit_once("line ")?;
+    let digits = rest.find(|c: char| !c.is_ascii_digit());
+    rest[..digits.unwrap_or(rest.len())].parse().ok()
 }
 
 /// The text without a last line that only ends the document.

@@ -258,6 +258,7 @@ fn a_matrix_that_is_none_is_named_by_its_line() {
         let message = ros::read(&text.replace(from, to)).unwrap_err().to_string();
         println!("{message}");
         assert!(message.contains("line 6"), "{message}");
+        assert!(message.contains("`distortion_coefficients: "), "{message}");
         assert!(!message.contains("untagged"), "{message}");
     }
 }

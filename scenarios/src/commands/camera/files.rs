@@ -124,7 +124,9 @@ pub(super) fn load(
             };
             let found = opencv::read_chosen(&text, &choice).map_err(fail)?;
             if member.is_none() && found.number.is_some() {
-                notes.push("the first camera of a pair; the second is FILE#2".into());
+                notes.push(format!(
+                    "the first camera of a pair; the second is {name}#2"
+                ));
             }
             if found.number == Some(2) && found.frame != "camera1_optical" {
                 notes.push("no R and T in the file: the second camera is in its own axes".into());
