@@ -1,7 +1,7 @@
 //! What a calibration was: its figures as JSON, and the same in a few lines.
 
 use super::{FRAME, Pictures, SIDES};
-use rover_cameras::calibration::{CELLS, Calibration, Parameter, QualityProblem, STRUCTURED_SHARE};
+use rover_cameras::calibration::{CELLS, Calibration, Parameter, QualityProblem};
 use serde_json::{Value, json};
 
 /// Mean error and its RMS over the cells of a camera's image; null where no corner was.
