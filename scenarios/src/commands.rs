@@ -103,7 +103,8 @@ impl From<OutputError> for CommandError {
     fn from(error: OutputError) -> Self {
         match error {
             OutputError::Exists { .. } => Self::BadInput(error.to_string()),
-            OutputError::File { .. } => Self::Internal(error.into()),
+            // Its text ends with what the system said; as a chain it would say so twice.
+            OutputError::File { .. } => Self::Internal(anyhow::Error::msg(error.to_string())),
         }
     }
 }

@@ -319,8 +319,21 @@ fn a_pair_is_calibrated_from_pictures_alone() {
             list.push(name);
         }
     }
+    // A pair given twice counts once, and is named.
+    lefts.push("l0.png".into());
+    rights.push("r0.png".into());
     args.extend(lefts.iter().chain(&rights).map(String::as_str));
-    done(folder.path(), &args);
+    let out = rover(folder.path(), &args);
+    let said = text(&out.stderr);
+    assert_eq!(out.status.code(), Some(0), "{said}");
+    for part in [
+        "l0.png + r0.png shows",
+        "counted once",
+        "fx 60",
+        "baseline: 8",
+    ] {
+        assert!(said.contains(part), "`{part}` is missing in: {said}");
+    }
     let result = folder.path().join("result");
     let read = |name: &str| fs::read_to_string(result.join(name)).unwrap();
     let report: serde_json::Value = serde_json::from_str(&read("report.json")).unwrap();
@@ -330,6 +343,14 @@ fn a_pair_is_calibrated_from_pictures_alone() {
         assert_eq!(report["residual_map"][side].as_array().unwrap().len(), 6);
     }
     assert_eq!(report["covariance"].as_array().unwrap().len(), 22);
+    assert_eq!(report["accepted"], true);
+    let pictures = report["pictures"].as_array().unwrap();
+    assert_eq!(pictures.len(), 14);
+    for picture in &pictures[..12] {
+        assert_eq!(picture["corners"], 54, "{picture}");
+        assert!(picture["rms_px"].as_f64().unwrap() < 0.1, "{picture}");
+    }
+    assert_eq!(pictures[12]["repeats_view"], 0);
     assert!(read("residuals.html").contains("<svg"));
     let found = read_text(&read("right.cahvor")).unwrap();
     assert_eq!(found.frame.as_deref(), Some("left_camera"));
@@ -352,6 +373,7 @@ fn a_pair_is_calibrated_from_pictures_alone() {
     let error_m = (seen_a - seen_b).norm() - (a - b).norm();
     assert!(error_m.abs() < 5e-4, "{error_m} m");
     refused(folder.path(), &args, &["--force"]);
+    pictures_that_are_no_pairs_are_refused_with_their_names(folder.path());
     refused(
         folder.path(),
         &[
@@ -365,4 +387,126 @@ fn a_pair_is_calibrated_from_pictures_alone() {
         ],
         &["chessboard:COLSxROWS:SQUARE_M"],
     );
+}
+
+/// The pictures l0.png to l5.png and r0.png to r5.png are there.
+fn pictures_that_are_no_pairs_are_refused_with_their_names(folder: &Path) {
+    let calibrate = |left: &[usize], right: &[usize], more: &[&str], parts: &[&str]| {
+        let mut args: Vec<String> = [
+            "calibrate",
+            "--board",
+            "chessboard:9x6:0.02",
+            "--out",
+            "bad",
+        ]
+        .map(str::to_owned)
+        .into();
+        args.extend(more.iter().map(|x| (*x).to_owned()));
+        args.push("--left".into());
+        args.extend(left.iter().map(|n| format!("l{n}.png")));
+        args.push("--right".into());
+        args.extend(right.iter().map(|n| format!("r{n}.png")));
+        let args: Vec<&str> = args.iter().map(String::as_str).collect();
+        refused(folder, &args, parts);
+        assert!(!folder.join("bad/left.cahvor").exists());
+    };
+    calibrate(
+        &[0, 1, 2, 3, 4],
+        &[1, 2, 3, 4, 5],
+        &["--force"],
+        &["no models written", "each camera alone fits"],
+    );
+    calibrate(&[0; 4], &[0; 4], &["--force"], &["1 different placements"]);
+    calibrate(
+        &[0, 1, 2, 3],
+        &[0, 1, 1, 3],
+        &["--force"],
+        &["l1.png + r1.png", "l2.png + r1.png", "right camera"],
+    );
+    calibrate(
+        &[0, 1, 2, 3],
+        &[0, 1, 2, 3],
+        &["--linearity", "0.5"],
+        &["--linearity 0.5", "--model cahvore"],
+    );
+}
+
+const STEREO: &str = "%YAML:1.0
+M1: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 500., 0., 320., 0., 500., 240., 0., 0., 1. ]
+D1: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ -0.2, 0.05, 0., 0., 0. ]
+M2: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 510., 0., 330., 0., 510., 240., 0., 0., 1. ]
+D2: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ -0.2, 0.05, 0.003, 0., 0.3 ]
+";
+
+#[test]
+fn the_cameras_of_a_stereo_file_are_taken_out_by_their_number() {
+    let folder = folder(&[("s.yml", STEREO), ("h.cahvore", HAZCAM)]);
+    let at = folder.path();
+    refused(at, &["info", "s.yml"], &["s.yml", "--size"]);
+    let size = ["--size", "640x480"];
+    let convert = |input: &str, more: &[&str]| {
+        let args = [&["convert", input, "-", "--to", "cahv"], &size[..], more].concat();
+        rover(at, &args)
+    };
+    for (input, focal) in [("s.yml", "500"), ("s.yml#1", "500")] {
+        let out = convert(input, &[]);
+        assert_eq!(out.status.code(), Some(0), "{}", text(&out.stderr));
+        assert!(text(&out.stdout).contains(&format!("H = {focal} 0 320")));
+    }
+    let out = convert("s.yml#2", &[]);
+    let said = text(&out.stderr);
+    assert_eq!(out.status.code(), Some(2), "{said}");
+    for part in ["CAHVOR or CAHVORE", "rover camera convert --limit-px"] {
+        assert!(said.contains(part), "`{part}` is missing in: {said}");
+    }
+    let out = convert("s.yml#2", &["--limit-px", "20"]);
+    assert_eq!(out.status.code(), Some(0), "{}", text(&out.stderr));
+    assert!(text(&out.stdout).contains("Frame = camera2_optical"));
+    refused(at, &["info", "h.cahvore#1"], &["h.cahvore", "#1"]);
+}
+
+#[test]
+fn pixels_outside_the_image_are_answered_only_if_asked_for() {
+    let camera = Camera::pinhole(
+        &Isometry3::identity(),
+        [600.0; 2],
+        [319.5, 239.5],
+        [640, 480],
+    );
+    let right = camera.transformed(&Isometry3::translation(0.08, 0.0, 0.0));
+    let folder = folder(&[
+        ("l.cahv", &write_text(&camera, None).unwrap()),
+        ("r.cahv", &write_text(&right, None).unwrap()),
+        ("px.csv", "u_px,v_px\n700,100\n"),
+        ("m.csv", "ul_px,vl_px,ur_px,vr_px\n720,100,600,100\n"),
+        ("p.csv", "x_m,y_m,z_m\n0.8,0,1\n"),
+    ]);
+    for args in [
+        vec!["ray", "l.cahv", "px.csv"],
+        vec!["triangulate", "l.cahv", "r.cahv", "m.csv"],
+        vec!["project", "l.cahv", "p.csv"],
+    ] {
+        let plain = rows(&done(folder.path(), &args));
+        let status = plain[1].last().unwrap();
+        assert!(status.contains("640 x 480"), "{args:?}: {status}");
+        let beyond = [&args[..], &["--beyond-image"]].concat();
+        let wide = rows(&done(folder.path(), &beyond));
+        assert_eq!(wide[1].last().unwrap(), "ok", "{args:?}");
+    }
 }

@@ -95,6 +95,21 @@ pub(crate) fn behind(point: &Vector3<f64>, range_m: f64) -> CameraError {
     }
 }
 
+/// The largest number up to `out`, which fails, for which `ahead` holds, as it does at 0.
+#[cold]
+pub(crate) fn last_ahead(out: f64, ahead: impl Fn(f64) -> bool) -> f64 {
+    let (mut low, mut high) = (0.0, out);
+    for _ in 0..60 {
+        let middle = 0.5 * (low + high);
+        if ahead(middle) {
+            low = middle;
+        } else {
+            high = middle;
+        }
+    }
+    low
+}
+
 #[inline]
 pub(crate) fn finite_pixel(pixel_px: Vector2<f64>) -> Result<Vector2<f64>, CameraError> {
     if pixel_px.x.is_finite() && pixel_px.y.is_finite() {

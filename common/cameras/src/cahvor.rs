@@ -1,6 +1,6 @@
 //! CAHVOR: CAHV behind a lens with radial distortion about its own optical axis (Gennery 1993).
 
-use crate::cahv::{behind, finite_pixel, ray_along, ray_from};
+use crate::cahv::{behind, finite_pixel, last_ahead, ray_along, ray_from};
 use crate::radial::{Radial, RadialError};
 use crate::{CameraError, Projection, Ray, linear};
 use nalgebra::{Isometry3, Matrix3, Matrix3x2, Point3, Vector2, Vector3};
@@ -71,7 +71,7 @@ impl Cahvor {
                 range_m,
             })
         } else {
-            Err(behind(point, range_m))
+            Err(self.refuse_point(point))
         }
     }
 
@@ -85,7 +85,19 @@ impl Cahvor {
         }
         let along_m = d.dot(&self.o);
         let across_m = (d - self.o * along_m).norm();
-        let limit = Radial(&self.r).limit().map_or(f64::INFINITY, f64::sqrt);
+        let across = d - self.o * along_m;
+        let radial = Radial(&self.r);
+        let limit = radial.limit().map_or(f64::INFINITY, f64::sqrt);
+        let tangent = across_m / along_m;
+        if along_m > 0.0 && tangent < limit {
+            // One-to-one, but the distortion carries it behind the image plane.
+            let toward = across.dot(&self.a) / across_m;
+            let ahead = |t: f64| {
+                let stretched = t * (1.0 + radial.displacement(t * t).0);
+                self.o.dot(&self.a) + stretched * toward > 0.0
+            };
+            return outside(tangent.atan(), last_ahead(tangent, ahead));
+        }
         outside(across_m.atan2(along_m), limit)
     }
 

@@ -1,7 +1,7 @@
 //! CAHVORE: a lens of any field of view whose entrance pupil moves along the optical axis with
 //! the angle of the ray (Gennery 2006).
 
-use crate::cahv::{behind, finite_pixel, ray_along};
+use crate::cahv::{behind, finite_pixel, last_ahead, ray_along};
 use crate::pupil::{Pupil, Sight};
 use crate::radial::{Radial, RadialError};
 use crate::{CameraError, Projection, Ray, RayJacobians, linear};
@@ -103,7 +103,21 @@ impl Cahvore {
         let offset = self.o * reach_m + across * (1.0 + mu);
         let range_m = offset.dot(&self.a);
         if !(range_m > 0.0) {
-            return Err(behind(point, range_m));
+            let own_m = d.dot(&self.a);
+            if !(own_m > 0.0 && range_m.is_finite()) {
+                return Err(behind(point, if own_m > 0.0 { range_m } else { own_m }));
+            }
+            // In front, but the distortion carries it behind the image plane.
+            let toward = across.dot(&self.a) / across_m;
+            let ahead = |theta: f64| {
+                let chi = self.pupil().chi(theta).0;
+                let stretched = chi * (1.0 + Radial(&self.r).displacement(chi * chi).0);
+                self.o.dot(&self.a) + stretched * toward > 0.0
+            };
+            return Err(CameraError::OutsideField {
+                off_axis_deg: sight.theta.to_degrees(),
+                limit_deg: last_ahead(sight.theta, ahead).to_degrees(),
+            });
         }
         Ok(Seen {
             sight,

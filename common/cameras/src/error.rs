@@ -1,16 +1,43 @@
 //! What can go wrong when a camera model is used.
 
 use nalgebra::{Vector2, Vector3};
+use std::fmt;
 use thiserror::Error;
+
+/// A number for a reader: five significant digits.
+#[derive(Clone, Copy)]
+pub(crate) struct Short(pub(crate) f64);
+
+impl fmt::Display for Short {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        const DIGITS: i32 = 5;
+        let size = self.0.abs();
+        if !size.is_finite() || size == 0.0 || size == size.trunc() && size < 1e9 {
+            return write!(f, "{}", self.0);
+        }
+        let whole = size.log10().floor() as i32 + 1;
+        if !(-3..=9).contains(&whole) {
+            return write!(f, "{:.4e}", self.0);
+        }
+        let decimals = usize::try_from(DIGITS - whole).unwrap_or(0);
+        let text = format!("{:.decimals$}", self.0);
+        let text = if text.contains('.') {
+            text.trim_end_matches('0').trim_end_matches('.')
+        } else {
+            &text
+        };
+        f.write_str(text)
+    }
+}
 
 /// Why a camera model gave no answer.
 #[derive(Clone, Debug, PartialEq, Error)]
 pub enum CameraError {
     /// The point does not lie in front of the camera, so it has no image.
     #[error(
-        "the point [{} {} {}] m lies {range_m} m along the camera's axis A; only points in front \
+        "the point [{} {} {}] m lies {} m along the camera's axis A; only points in front \
          of the camera (> 0 m) have an image",
-        point.x, point.y, point.z
+        Short(point.x), Short(point.y), Short(point.z), Short(*range_m)
     )]
     BehindCamera {
         /// The point, in the model's frame, metres.
@@ -21,8 +48,9 @@ pub enum CameraError {
     /// The point or pixel lies so far from the optical axis that the distortion polynomial is no
     /// longer one-to-one there: the model says nothing about it.
     #[error(
-        "the direction is {off_axis_deg} deg from the optical axis O; the distortion polynomial is \
-         one-to-one only within {limit_deg} deg"
+        "the direction is {} deg from the optical axis O; the distortion is one-to-one and ahead \
+         of the camera only within {} deg",
+        Short(*off_axis_deg), Short(*limit_deg)
     )]
     OutsideField {
         /// Angle from the optical axis O: of the direction itself in a projection, of the
@@ -34,8 +62,8 @@ pub enum CameraError {
     /// The inversion of the distortion polynomial did not settle.
     #[error(
         "the distortion of pixel ({}, {}) could not be inverted: after {iterations} iterations the \
-         last step was {last_step}, expected below 1e-12",
-        pixel_px.x, pixel_px.y
+         last step was {last_step:.1e}, expected below 1e-12",
+        Short(pixel_px.x), Short(pixel_px.y)
     )]
     NoConvergence {
         /// The pixel whose ray was asked for.
@@ -47,9 +75,9 @@ pub enum CameraError {
     },
     /// The point lies at the entrance pupil, or so near that several rays of the lens reach it.
     #[error(
-        "the point [{} {} {}] m lies {distance_m} m in front of the entrance pupil, inside the \
-         lens: no single ray reaches it",
-        point.x, point.y, point.z
+        "the point [{} {} {}] m lies {} m in front of the entrance pupil, inside the lens: no \
+         single ray reaches it",
+        Short(point.x), Short(point.y), Short(point.z), Short(*distance_m)
     )]
     NearPupil {
         /// The point, in the model's frame, metres.
@@ -60,8 +88,8 @@ pub enum CameraError {
     /// The angle at which a point is seen through the moving entrance pupil did not settle.
     #[error(
         "the ray to the point [{} {} {}] m was not found: after {iterations} iterations the last \
-         step was {last_step} rad, expected below 1e-10",
-        point.x, point.y, point.z
+         step was {last_step:.1e} rad, expected below 1e-10",
+        Short(point.x), Short(point.y), Short(point.z)
     )]
     PupilNotFound {
         /// The point, in the model's frame, metres.
@@ -71,14 +99,14 @@ pub enum CameraError {
         /// The last change of the angle from O, radians.
         last_step: f64,
     },
-    /// The point is imaged beyond the borders of the image.
+    /// The point is imaged beyond the borders of the image, or the pixel asked for lies there.
     #[error(
-        "the point is imaged at ({}, {}) px, outside the {width_px} x {height_px} px image with a \
-         margin of {margin_px} px",
-        pixel_px.x, pixel_px.y
+        "the pixel ({}, {}) is outside the {width_px} x {height_px} px image with a margin of \
+         {margin_px} px",
+        Short(pixel_px.x), Short(pixel_px.y)
     )]
     OutsideImage {
-        /// Where it is imaged.
+        /// The pixel.
         pixel_px: Vector2<f64>,
         /// Width of the image, px.
         width_px: u32,

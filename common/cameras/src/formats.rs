@@ -13,9 +13,12 @@
 //! and by a fit with its worst error where they are not.
 
 pub mod conversion;
+mod fit;
 pub mod kalibr;
 mod lens;
+mod lens_fit;
 pub mod opencv;
+mod pose;
 pub mod ros;
 pub mod text;
 pub mod toml;
@@ -108,7 +111,10 @@ pub enum FormatError {
         expected: &'static str,
     },
     /// A camera needs an image size and the file has none.
-    #[error("the image size is missing, expected a line Dimensions = WIDTH HEIGHT")]
+    #[error(
+        "the image size is missing: Dimensions in CAHV text, size_px in TOML, or `rover camera \
+         convert --size WIDTHxHEIGHT`"
+    )]
     NoSize,
     /// The text is not YAML, or not of the structure that the format has.
     #[error("{message}")]

@@ -11,8 +11,9 @@ use clap::Subcommand;
 
 /// Camera models: what they say, projection, rays, triangulation, conversion, calibration
 ///
-/// A model file is CAHV text, TOML, ROS CameraInfo YAML, OpenCV YAML or a Kalibr chain (of which
-/// FILE#1 is the second camera); `-` is standard input.
+/// A model file is CAHV text, TOML, ROS CameraInfo YAML, OpenCV YAML or a Kalibr chain; `-` is standard
+/// input. Of a file with several cameras FILE#N is the one that the file numbers N: cam1 of a Kalibr
+/// chain, M2 of an OpenCV stereo file.
 #[derive(Clone, Debug, clap::Args)]
 pub struct CameraArgs {
     #[command(subcommand)]

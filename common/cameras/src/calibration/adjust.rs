@@ -1,7 +1,7 @@
 //! The joint adjustment: robust weights, normal equations, rejection, covariance.
 
 use super::rig::{Rig, difference_step, own_camera};
-use super::{BoardView, CalibrationRules, Residual};
+use super::{BoardView, CalibrationRules, MAX_PICTURE_REJECTED, Residual};
 use crate::CameraModel;
 use crate::least_squares::{Minimum, Normal, Problem, minimise};
 use nalgebra::{DMatrix, DVector, Matrix2x3, Point3, SMatrix, Vector2, Vector3};
@@ -11,6 +11,8 @@ pub(super) struct Adjustment<'a> {
     views: &'a [BoardView],
     /// Per view, camera, corner: whether it counts.
     used: Vec<Vec<Vec<bool>>>,
+    /// Per view: whether it is left out as a whole, for good.
+    dropped: Vec<bool>,
     sigma_px: f64,
     /// Errors beyond this many sigma weigh less; infinite for plain least squares.
     huber_sigma: f64,
@@ -53,6 +55,7 @@ impl<'a> Adjustment<'a> {
                 .iter()
                 .map(|view| view.iter().map(|points| vec![true; points.len()]).collect())
                 .collect(),
+            dropped: vec![false; views.len()],
             sigma_px: FIRST_SIGMA_PX,
             huber_sigma: rules.huber_sigma,
             priors: [o, o, r, r, e, e, e],
@@ -61,6 +64,13 @@ impl<'a> Adjustment<'a> {
 
     pub(super) fn sigma_px(&self) -> f64 {
         self.sigma_px
+    }
+
+    /// The views that are left out.
+    pub(super) fn dropped(&self) -> Vec<usize> {
+        (0..self.dropped.len())
+            .filter(|view| self.dropped[*view])
+            .collect()
     }
 
     pub(super) fn run(&self, start: Rig, iterations: u32) -> Option<Minimum<Rig>> {
@@ -159,7 +169,11 @@ impl<'a> Adjustment<'a> {
     /// Estimates the noise and decides anew which corners count; whether anything changed.
     pub(super) fn reweigh(&mut self, rig: &Rig, rules: &CalibrationRules, round: usize) -> bool {
         let residuals = self.residuals(rig);
-        let mut lengths: Vec<f64> = residuals.iter().map(|r| r.error_px.norm()).collect();
+        let mut lengths: Vec<f64> = residuals
+            .iter()
+            .filter(|r| !self.dropped[r.view])
+            .map(|r| r.error_px.norm())
+            .collect();
         lengths.sort_by(f64::total_cmp);
         let bulk = lengths.get(lengths.len() / 2).copied().unwrap_or(0.0) / MEDIAN_LENGTH;
         let before = (self.sigma_px, self.used.clone());
@@ -170,8 +184,18 @@ impl<'a> Adjustment<'a> {
         }
         let limit = rules.reject_sigma * bulk.max(LEAST_SIGMA_PX);
         let mut lengths = residuals.iter().map(|r| r.error_px.norm());
-        for used in self.used.iter_mut().flatten().flatten() {
-            *used = lengths.next().is_some_and(|length| length <= limit);
+        for (view, dropped) in self.used.iter_mut().zip(&mut self.dropped) {
+            for used in view.iter_mut().flatten() {
+                *used = lengths.next().is_some_and(|length| length <= limit) && !*dropped;
+            }
+            let lost = |picture: &Vec<bool>| {
+                let rejected = picture.iter().filter(|used| !**used).count();
+                rejected as f64 > MAX_PICTURE_REJECTED * picture.len() as f64
+            };
+            if *dropped || view.iter().any(lost) {
+                *dropped = true;
+                view.iter_mut().flatten().for_each(|used| *used = false);
+            }
         }
         self.huber_sigma = f64::INFINITY;
         // Unbiased: as many degrees of freedom as there are unknowns are used up.
@@ -182,7 +206,8 @@ impl<'a> Adjustment<'a> {
             .fold((0.0, 0_usize), |(sum, n), r| {
                 (sum + r.error_px.norm_squared(), n + 2)
             });
-        let unknowns = rig.board_at(rig.camera_from_board.len());
+        let kept = self.dropped.iter().filter(|dropped| !**dropped).count();
+        let unknowns = rig.board_at(kept);
         let freedom = n.saturating_sub(unknowns).max(1);
         self.sigma_px = (sum / freedom as f64).sqrt().max(LEAST_SIGMA_PX);
         self.used != before.1 || (self.sigma_px / before.0 - 1.0).abs() > 1e-3
@@ -301,6 +326,11 @@ impl Problem for Adjustment<'_> {
                 hessian[(at + i, at + i)] += 1.0 / (sigma * sigma);
                 gradient[at + i] += x / (sigma * sigma);
             }
+        }
+        // Nothing asks for the pose of a view left out: it stays.
+        for view in self.dropped() {
+            let at = rig.board_at(view);
+            (at..at + 6).for_each(|i| hessian[(i, i)] = 1.0);
         }
         Some(Normal {
             hessian,

@@ -15,14 +15,28 @@
 //! focal lengths. O and E are drawn weakly to `O = A` and `E = 0` ([`CalibrationRules`]), because a
 //! lens with little distortion does not show where its axis is, nor one far from the board where
 //! its pupil is.
+//!
+//! **What is refused.** A view of which one picture loses more than half of its corners
+//! ([`MAX_PICTURE_REJECTED`]) is left out as a whole and listed ([`Calibration::dropped`]): a pair
+//! that is none, a board that moved between the exposures. Placements that repeat another do not
+//! count ([`repeats`]), pictures that contradict each other are refused, and
+//! [`Calibration::problems`] says which of the stated limits ([`QualityLimits`]) a result does not
+//! keep.
 
 mod adjust;
+mod quality;
 mod rig;
 mod start;
 
+use crate::error::Short;
 use crate::{Camera, CameraError};
 use adjust::Adjustment;
 use nalgebra::{DMatrix, Isometry3, Vector2};
+pub use quality::{
+    CELLS, MAX_PICTURE_REJECTED, PictureFit, QualityLimits, QualityProblem, SAME_PLACEMENT_PX,
+    STRUCTURED_PX, STRUCTURED_SHARE, repeats,
+};
+use quality::{check_pairs, side};
 use rig::Rig;
 use thiserror::Error;
 
@@ -126,22 +140,66 @@ pub struct Calibration {
     pub rms_px: Vec<f64>,
     /// Standard deviation of one coordinate of one corner, px.
     pub sigma_px: f64,
-    /// Corners rejected.
+    /// Corners rejected, with all of the views left out.
     pub rejected: usize,
+    /// Views left out because most corners of one of their pictures were rejected.
+    pub dropped: Vec<usize>,
 }
 
 /// Why there is no calibration.
 #[derive(Clone, Debug, PartialEq, Error)]
 pub enum CalibrationError {
     /// Too little was seen.
-    #[error("camera {camera} sees the board in {found} views, expected at least {expected}")]
+    #[error(
+        "the {} camera sees {found} different placements of the board, expected at least {expected}",
+        side(*camera)
+    )]
     TooFewViews {
         /// 0 left, 1 right.
         camera: usize,
-        /// Views with enough corners.
+        /// Placements seen; one that repeats another does not count.
         found: usize,
         /// The least number.
         expected: usize,
+    },
+    /// Too little is left of what was seen.
+    #[error(
+        "{} of {views} placements of the board do not fit the others, leaving {left} to the {} \
+         camera, expected at least {expected}",
+        dropped.len(), side(*camera)
+    )]
+    Inconsistent {
+        /// 0 left, 1 right.
+        camera: usize,
+        /// All views.
+        views: usize,
+        /// Views left to the camera.
+        left: usize,
+        /// The least number.
+        expected: usize,
+        /// Views that do not fit.
+        dropped: Vec<usize>,
+    },
+    /// Both pictures of a pair are one picture.
+    #[error(
+        "view {view}: both cameras see every corner within {SAME_PLACEMENT_PX} px of the same \
+         pixel, expected pictures of two cameras"
+    )]
+    SamePicture {
+        /// Placement of the board, from 0.
+        view: usize,
+    },
+    /// The board stands still for one camera and moves for the other.
+    #[error(
+        "views {} and {}: the board is in one place for the {} camera and in two for the other, \
+         expected pictures taken at the same time",
+        views[0], views[1], side(*camera)
+    )]
+    Mispaired {
+        /// The camera for which it stands still: 0 left, 1 right.
+        camera: usize,
+        /// The two placements, from 0.
+        views: [usize; 2],
     },
     /// Two cameras never saw the board together.
     #[error("no view shows the board to both cameras")]
@@ -155,15 +213,16 @@ pub enum CalibrationError {
         reason: String,
     },
     /// No start values led to an image of the board.
-    #[error("camera {camera}: no focal length explains its views")]
+    #[error("no focal length explains the views of the {} camera", side(*camera))]
     NoStart {
         /// 0 left, 1 right.
         camera: usize,
     },
     /// The views leave a parameter open.
     #[error(
-        "the views do not determine {parameter}: its standard deviation is {sigma} at a value of \
-         {value}; views of the board tilted by 20 to 50 degrees about both axes are needed"
+        "the views do not determine {parameter}: it is {} +- {}; views of the board tilted by 20 \
+         to 50 degrees about both axes are needed",
+        Short(*value), Short(*sigma)
     )]
     Undetermined {
         /// The parameter.
@@ -174,19 +233,41 @@ pub enum CalibrationError {
         sigma: f64,
     },
     /// The adjustment did not settle.
-    #[error("the adjustment did not settle within {iterations} iterations")]
+    #[error(
+        "the adjustment did not settle within {iterations} iterations: the corners contradict each \
+         other by about {} px, {} placements of the board do not fit the others",
+        Short(*sigma_px), dropped.len()
+    )]
     NotSettled {
         /// Iterations made.
         iterations: u32,
+        /// Typical error of one coordinate of a corner where it ended, px.
+        sigma_px: f64,
+        /// Views that do not fit.
+        dropped: Vec<usize>,
     },
     /// The result is no camera.
     #[error(transparent)]
     Camera(#[from] CameraError),
 }
 
+impl CalibrationError {
+    /// The views that the error is about, from 0.
+    pub fn views(&self) -> Vec<usize> {
+        match self {
+            Self::View { view, .. } | Self::SamePicture { view } => vec![*view],
+            Self::Mispaired { views, .. } => views.to_vec(),
+            Self::Inconsistent { dropped, .. } | Self::NotSettled { dropped, .. } => {
+                dropped.clone()
+            }
+            _ => Vec::new(),
+        }
+    }
+}
+
 /// Least number of corners that make a view.
 pub const MIN_CORNERS: usize = 8;
-/// Least number of views per camera.
+/// Least number of different placements of the board per camera.
 pub const MIN_VIEWS: usize = 3;
 const ITERATIONS: u32 = 100;
 const ROUNDS: usize = 8;
@@ -212,15 +293,14 @@ pub fn calibrate(
     for round in 0..ROUNDS {
         let minimum = adjustment
             .run(rig.clone(), ITERATIONS)
-            .ok_or(CalibrationError::NotSettled { iterations: 0 })?;
+            .ok_or_else(|| not_settled(&adjustment, 0))?;
         rig = minimum.state;
         if !minimum.settled && round + 1 == ROUNDS {
-            return Err(CalibrationError::NotSettled {
-                iterations: minimum.iterations,
-            });
+            return Err(not_settled(&adjustment, minimum.iterations));
         }
         // First robust with a scale from the bulk, then plain without the outliers.
         let changed = adjustment.reweigh(&rig, rules, round);
+        enough_left(views, &adjustment)?;
         if !changed && round >= 2 {
             break;
         }
@@ -253,8 +333,14 @@ fn check(sizes_px: &[[u32; 2]], views: &[BoardView]) -> Result<(), CalibrationEr
             }
         }
     }
+    check_pairs(views)?;
+    let repeats = repeats(views);
     for camera in 0..sizes_px.len() {
-        let found = views.iter().filter(|v| !v[camera].is_empty()).count();
+        let found = views
+            .iter()
+            .zip(&repeats)
+            .filter(|(v, repeats)| !v[camera].is_empty() && repeats.is_none())
+            .count();
         if found < MIN_VIEWS {
             return Err(CalibrationError::TooFewViews {
                 camera,
@@ -266,6 +352,33 @@ fn check(sizes_px: &[[u32; 2]], views: &[BoardView]) -> Result<(), CalibrationEr
     let common = |v: &BoardView| v.iter().all(|points| !points.is_empty());
     if !views.iter().any(common) {
         return Err(CalibrationError::NoCommonView);
+    }
+    Ok(())
+}
+
+fn not_settled(adjustment: &Adjustment, iterations: u32) -> CalibrationError {
+    CalibrationError::NotSettled {
+        iterations,
+        sigma_px: adjustment.sigma_px(),
+        dropped: adjustment.dropped(),
+    }
+}
+
+/// Whether the views that still count are as many as a calibration needs.
+fn enough_left(views: &[BoardView], adjustment: &Adjustment) -> Result<(), CalibrationError> {
+    let dropped = adjustment.dropped();
+    for camera in 0..views[0].len() {
+        let seen = |n: &usize| !views[*n][camera].is_empty() && !dropped.contains(n);
+        let left = (0..views.len()).filter(seen).count();
+        if left < MIN_VIEWS {
+            return Err(CalibrationError::Inconsistent {
+                camera,
+                views: views.len(),
+                left,
+                expected: MIN_VIEWS,
+                dropped,
+            });
+        }
     }
     Ok(())
 }
@@ -318,6 +431,7 @@ fn finish(
         covariance,
         camera_from_board: rig.camera_from_board,
         rejected: residuals.iter().filter(|r| !r.used).count(),
+        dropped: adjustment.dropped(),
         residuals,
         rms_px,
         sigma_px: adjustment.sigma_px(),

@@ -5,8 +5,9 @@
 
 use super::FormatError;
 use super::lens::{Lens, LensCamera};
+use super::pose::rotation;
 use super::yaml::{self, all_finite, list, wrong};
-use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix3, Translation3, Vector3};
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -36,9 +37,6 @@ struct File {
     #[serde(default, rename = "line_delay")]
     _line_delay_s: Option<f64>,
 }
-
-/// Largest deviation of a rotation from orthonormal that is mended rather than refused.
-const ROTATION_TOLERANCE: f64 = 1e-4;
 
 /// Whether a text is of this format: its cameras are named `cam0`, `cam1`, ...
 pub fn is_kalibr(text: &str) -> bool {
@@ -146,19 +144,15 @@ fn pose(field: &str, rows: &[Vec<f64>]) -> Result<Isometry3<f64>, FormatError> {
         ));
     }
     all_finite(field, &flat)?;
-    let rotation = Matrix3::from_fn(|i, j| rows[i][j]);
-    let error = (rotation * rotation.transpose() - Matrix3::identity()).amax();
-    if !(error < ROTATION_TOLERANCE && rotation.determinant() > 0.0)
-        || rows[3] != [0.0, 0.0, 0.0, 1.0]
-    {
+    if rows[3] != [0.0, 0.0, 0.0, 1.0] {
         return Err(wrong(
             field,
-            format_args!("a matrix {error} from a rotation"),
-            "a rotation and a translation over the row 0, 0, 0, 1",
+            format_args!("the last row {:?}", rows[3]),
+            "the last row [0, 0, 0, 1]",
         ));
     }
     let shift = Vector3::new(rows[0][3], rows[1][3], rows[2][3]);
-    let turn = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&rotation));
+    let turn = rotation(field, &Matrix3::from_fn(|i, j| rows[i][j]))?;
     Ok(Isometry3::from_parts(Translation3::from(shift), turn))
 }
 

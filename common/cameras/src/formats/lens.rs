@@ -57,6 +57,15 @@ impl Lens {
         p: [0.0; 2],
     };
 
+    /// The distorted radius of a direction whose angle from the axis has the tangent `t`, without
+    /// tangential terms.
+    pub(super) fn radial(&self, t: f64) -> f64 {
+        match self {
+            Self::Polynomial { k, .. } => polynomial(k, &[0.0; 2], &Vector2::new(t, 0.0)).0.x,
+            Self::Equidistant { k } => equidistant(k, t.atan()).0,
+        }
+    }
+
     /// `(x', y')` of a direction in the camera's axes; `None` where it has none.
     fn distorted(&self, d: &Vector3<f64>) -> Option<Vector2<f64>> {
         match self {

@@ -1,22 +1,34 @@
 //! ROS `CameraInfo` as YAML: the calibration files of `camera_calibration_parsers`, and the message
 //! itself as `ros2 topic echo` prints it.
 //!
-//! `R` and `P` describe the rectified image and are not used; the file holds no pose, so the model
-//! is in the camera's own axes (x right, y down, z forward; `camera_optical` unless the message
-//! names its frame).
+//! `R` and `P` describe the rectified image. In a file of a stereo pair they hold its pose too: `R`
+//! turns the camera's axes to those of the rectified pair, and the fourth column of `P` is
+//! `-fx Bx, -fy By` for a camera at `(Bx, By, 0)` from the left one. If `R` is not the identity or that
+//! column not zero, the model is therefore given in the axes of the rectified left camera
+//! ([`RECTIFIED`]: x right along the baseline, y down, z forward), the same for both cameras of the
+//! pair. Otherwise (and if they are missing or all zeros) it is in the camera's own axes (x right,
+//! y down, z forward; `camera_optical` unless the file names its frame). What else `P` says, the
+//! focal lengths of the rectified image, is not used.
 
 use super::lens::{Lens, LensCamera};
+use super::pose::rotation;
 use super::yaml::{self, all_finite, list, number, wrong};
 use super::{FormatError, shown};
-use nalgebra::Isometry3;
-use serde::Deserialize;
-use std::fmt::Write;
+use nalgebra::{Isometry3, Matrix3, Translation3, UnitQuaternion};
+use serde::de::{MapAccess, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer};
+use std::fmt::{self, Write};
+
+/// The frame of models that take their pose from `R` and `P`.
+pub const RECTIFIED: &str = "rectified_left";
 
 /// What a file holds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraInfo {
-    /// The camera, in its own axes.
+    /// The camera, in its own axes or, if it is `posed`, in those of the rectified left camera.
     pub camera: LensCamera,
+    /// Whether `R` and `P` gave it a pose.
+    pub posed: bool,
     /// `camera_name`, or the frame of the message's header.
     pub name: Option<String>,
 }
@@ -68,40 +80,74 @@ struct Roi {
     height: u32,
 }
 
-#[derive(Deserialize)]
-#[serde(untagged)]
-enum Matrix {
-    List(Vec<f64>),
-    Shaped {
-        #[serde(default)]
-        rows: Option<usize>,
-        #[serde(default)]
-        cols: Option<usize>,
-        data: Vec<f64>,
-    },
+/// A list of numbers, or `rows`, `cols` and `data`.
+struct Matrix {
+    shape: Option<(usize, usize)>,
+    data: Vec<f64>,
+}
+
+impl<'de> Deserialize<'de> for Matrix {
+    fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
+        struct Either;
+        impl<'de> Visitor<'de> for Either {
+            type Value = Matrix;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("a list of numbers, or rows, cols and data of a matrix")
+            }
+
+            fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Matrix, A::Error> {
+                let mut data = Vec::new();
+                while let Some(x) = list.next_element()? {
+                    data.push(x);
+                }
+                Ok(Matrix { shape: None, data })
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<Matrix, A::Error> {
+                #[derive(Deserialize)]
+                #[serde(deny_unknown_fields)]
+                struct Shaped {
+                    #[serde(default)]
+                    rows: Option<usize>,
+                    #[serde(default)]
+                    cols: Option<usize>,
+                    #[serde(default, rename = "dt")]
+                    _type: Option<String>,
+                    data: Vec<f64>,
+                }
+                let from = serde::de::value::MapAccessDeserializer::new(map);
+                let Shaped {
+                    rows, cols, data, ..
+                } = Shaped::deserialize(from)?;
+                Ok(Matrix {
+                    shape: rows.zip(cols),
+                    data,
+                })
+            }
+        }
+        from.deserialize_any(Either)
+    }
 }
 
 impl Matrix {
     /// The numbers, if they are as many as the shape says and as `expected` allows.
     fn numbers(&self, field: &str, expected: &[usize]) -> Result<&[f64], FormatError> {
-        let (data, shape) = match self {
-            Self::List(data) => (data, None),
-            Self::Shaped { rows, cols, data } => (data, rows.zip(*cols)),
-        };
-        if let Some((rows, cols)) = shape
+        let data = &self.data;
+        if let Some((rows, cols)) = self.shape
             && rows.checked_mul(cols) != Some(data.len())
         {
             return Err(wrong(
                 field,
-                format_args!("{} numbers", data.len()),
-                format!("{rows} x {cols} numbers"),
+                format_args!("{} numbers of data", data.len()),
+                format!("{rows} x {cols} as its rows and cols say"),
             ));
         }
         if !expected.contains(&data.len()) {
             return Err(wrong(
                 field,
                 format_args!("{} numbers", data.len()),
-                format!("{expected:?} numbers"),
+                yaml::counts(expected),
             ));
         }
         all_finite(field, data)?;
@@ -165,12 +211,7 @@ pub fn read(text: &str) -> Result<CameraInfo, FormatError> {
             ));
         }
     };
-    if let Some(r) = &file.rectification_matrix {
-        r.numbers("rectification_matrix", &[9])?;
-    }
-    if let Some(p) = &file.projection_matrix {
-        p.numbers("projection_matrix", &[12])?;
-    }
+    let frame_from_camera = pose(&file)?;
     if file.binning_x > 1 || file.binning_y > 1 {
         return Err(wrong(
             "binning",
@@ -191,7 +232,7 @@ pub fn read(text: &str) -> Result<CameraInfo, FormatError> {
         ));
     }
     let camera = LensCamera {
-        frame_from_camera: Isometry3::identity(),
+        frame_from_camera: frame_from_camera.unwrap_or_else(Isometry3::identity),
         focal_px,
         centre_px,
         size_px: [file.image_width, file.image_height],
@@ -201,7 +242,41 @@ pub fn read(text: &str) -> Result<CameraInfo, FormatError> {
     let name = file
         .camera_name
         .or_else(|| file.header.and_then(|header| header.frame_id));
-    Ok(CameraInfo { camera, name })
+    Ok(CameraInfo {
+        camera,
+        posed: frame_from_camera.is_some(),
+        name,
+    })
+}
+
+/// The pose that `R` and `P` give, in the axes of the rectified left camera.
+fn pose(file: &File) -> Result<Option<Isometry3<f64>>, FormatError> {
+    let numbers = |matrix: &Option<Matrix>, field: &str, n: usize| {
+        let data = matrix.as_ref().map(|m| m.numbers(field, &[n]));
+        let data = data.transpose()?.unwrap_or_default().to_vec();
+        Ok::<_, FormatError>(Some(data).filter(|data| data.iter().any(|x| *x != 0.0)))
+    };
+    let r = numbers(&file.rectification_matrix, "rectification_matrix", 9)?;
+    let p = numbers(&file.projection_matrix, "projection_matrix", 12)?;
+    let turn = match r {
+        Some(r) => rotation("rectification_matrix", &Matrix3::from_row_slice(&r))?,
+        None => UnitQuaternion::identity(),
+    };
+    let mut shift = Translation3::identity();
+    if let Some(p) = p {
+        if p[11] != 0.0 || [p[0], p[5]].iter().any(|f| !(*f > 0.0)) {
+            return Err(wrong(
+                "projection_matrix",
+                format_args!("{p:?}"),
+                "[fx, 0, cx, -fx Bx, 0, fy, cy, -fy By, 0, 0, 1, 0]",
+            ));
+        }
+        // Without the sign of a zero.
+        shift = Translation3::new(0.0 - p[3] / p[0], 0.0 - p[7] / p[5], 0.0);
+    }
+    // Rectification that does nothing is written to seven digits or more.
+    let own = turn.angle() < 1e-9 && shift.vector.amax() == 0.0;
+    Ok((!own).then(|| Isometry3::from_parts(shift, turn)))
 }
 
 /// Writes the calibration file of a camera. Its pose has no place in it.

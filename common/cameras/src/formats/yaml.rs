@@ -1,12 +1,13 @@
 //! Bounded reading of YAML, and numbers that every YAML reader takes for numbers.
 
-use super::{FormatError, MAX_BYTES, brief};
+use super::{FormatError, MAX_BYTES, brief, shown};
 use serde::de::DeserializeOwned;
 
 /// Deepest nesting that is read; the deepest of the formats has five levels.
 const MAX_DEPTH: usize = 12;
 
-/// Reads one YAML document. Aliases, which can make a short text long, are refused.
+/// Reads one YAML document; a mark that ends it (`---` as `ros2 topic echo` prints it, or `...`) may
+/// follow. Aliases, which can make a short text long, are refused.
 pub(super) fn read<T: DeserializeOwned>(text: &str) -> Result<T, FormatError> {
     if text.len() > MAX_BYTES {
         return Err(FormatError::TooLong { found: text.len() });
@@ -21,12 +22,31 @@ pub(super) fn read<T: DeserializeOwned>(text: &str) -> Result<T, FormatError> {
             max_documents: 1,
         },
     };
-    serde_saphyr::from_str_with_options(text, options).map_err(|error| {
-        let bare = error.without_snippet();
-        FormatError::Structure {
-            message: brief(&bare.to_string()),
-        }
+    serde_saphyr::from_str_with_options(without_mark(text), options).map_err(|error| {
+        let message = brief(&error.without_snippet().to_string());
+        let message = match line_of(&message).and_then(|n| text.lines().nth(n.checked_sub(1)?)) {
+            Some(line) => format!("{message}: `{}`", shown(&brief(line))),
+            None => message,
+        };
+        FormatError::Structure { message }
     })
+}
+
+/// The line that a message of the reader names, from 1.
+fn line_of(message: &str) -> Option<usize> {
+    let (_, rest) = message.rsplit_once("line ")?;
+    let digits = rest.find(|c: char| !c.is_ascii_digit());
+    rest[..digits.unwrap_or(rest.len())].parse().ok()
+}
+
+/// The text without a last line that only ends the document.
+fn without_mark(text: &str) -> &str {
+    let end = text.trim_end();
+    ["---", "..."]
+        .iter()
+        .filter_map(|mark| end.strip_suffix(mark))
+        .find(|rest| rest.ends_with('\n'))
+        .unwrap_or(text)
 }
 
 /// A number as YAML 1.1 and 1.2 both read it: with a point, and a sign in the exponent.
@@ -64,5 +84,15 @@ pub(super) fn wrong(
         field: field.to_owned(),
         found: super::shown(&found.to_string()),
         expected: expected.into(),
+    }
+}
+
+/// `4, 5 or 8 numbers`.
+pub(super) fn counts(counts: &[usize]) -> String {
+    let words: Vec<String> = counts.iter().map(ToString::to_string).collect();
+    match words.split_last() {
+        Some((last, [])) => format!("{last} numbers"),
+        Some((last, rest)) => format!("{} or {last} numbers", rest.join(", ")),
+        None => "no numbers".into(),
     }
 }

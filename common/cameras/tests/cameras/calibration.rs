@@ -25,13 +25,13 @@ impl Noise {
     }
 }
 
-const SIZE_PX: [u32; 2] = [640, 480];
+pub const SIZE_PX: [u32; 2] = [640, 480];
 
-struct Truth {
-    cameras: Vec<Camera>,
+pub struct Truth {
+    pub cameras: Vec<Camera>,
     /// In the order of the calibration's parameters.
-    values: Vec<f64>,
-    kind: ModelKind,
+    pub values: Vec<f64>,
+    pub kind: ModelKind,
 }
 
 /// Intrinsics: fx, fy, cx, cy, tilt (2), r1, r2, e (3).
@@ -64,8 +64,11 @@ fn camera(kind: ModelKind, p: &[f64]) -> Camera {
 }
 
 fn truth(kind: ModelKind, left: &[f64], right: &[f64]) -> Truth {
+    shifted(kind, left, right, Vector3::new(-0.08, 0.001, 0.002))
+}
+
+fn shifted(kind: ModelKind, left: &[f64], right: &[f64], shift: Vector3<f64>) -> Truth {
     let turn = Vector3::new(0.01, -0.02, 0.005);
-    let shift = Vector3::new(-0.08, 0.001, 0.002);
     let right_from_left =
         Isometry3::from_parts(Translation3::from(shift), UnitQuaternion::new(turn));
     let mut values = left.to_vec();
@@ -81,16 +84,22 @@ fn truth(kind: ModelKind, left: &[f64], right: &[f64]) -> Truth {
     }
 }
 
-fn paper_pair() -> Truth {
-    truth(
+pub fn paper_pair() -> Truth {
+    pair_with(Vector3::new(-0.08, 0.001, 0.002))
+}
+
+/// The pair with another place of the right camera: `shift` from left to right axes.
+pub fn pair_with(shift: Vector3<f64>) -> Truth {
+    shifted(
         ModelKind::Cahvor,
         &[602.0, 600.5, 322.0, 236.0, 0.004, -0.003, -0.12, 0.03],
         &[598.0, 599.0, 316.0, 241.0, -0.006, 0.002, -0.11, 0.02],
+        shift,
     )
 }
 
 /// A board of 9 x 6 corners, 20 mm apart, `distance_m` in front of the pair and tilted.
-fn views(truth: &Truth, n: usize, noise_px: f64, seed: u64, tilt_rad: f64) -> Vec<BoardView> {
+pub fn views(truth: &Truth, n: usize, noise_px: f64, seed: u64, tilt_rad: f64) -> Vec<BoardView> {
     let mut noise = Noise(seed);
     (0..n)
         .map(|_| {
@@ -128,7 +137,7 @@ fn views(truth: &Truth, n: usize, noise_px: f64, seed: u64, tilt_rad: f64) -> Ve
         .collect()
 }
 
-fn rules(kind: ModelKind) -> CalibrationRules {
+pub fn rules(kind: ModelKind) -> CalibrationRules {
     CalibrationRules {
         model: kind,
         ..CalibrationRules::default()

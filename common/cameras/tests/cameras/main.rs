@@ -3,8 +3,11 @@
 
 mod cahvore;
 mod calibration;
+mod calibration_quality;
 mod common;
 mod conversion;
+mod conversion_fit;
+mod foreign_files;
 mod formats;
 mod models;
 mod reference;

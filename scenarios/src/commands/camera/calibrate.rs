@@ -1,25 +1,31 @@
 //! `rover camera calibrate`: cameras from pictures of a chessboard whose poses nobody measured.
 
 mod page;
+mod report;
 
 use super::files::json;
 use crate::{commands::CommandError, output::Output};
 use anyhow::anyhow;
 use nalgebra::Vector2;
 use rover_cameras::{
-    calibration::{BoardPoint, BoardView, Calibration, CalibrationRules, ModelKind, calibrate},
+    calibration::{
+        BoardPoint, BoardView, CalibrationError, CalibrationRules, ModelKind, QualityLimits,
+        calibrate, repeats,
+    },
     formats::write_text,
 };
 use rover_vision::board::{Chessboard, find_chessboard};
 use rover_vision::image::Image8;
-use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
 /// Calibrates a stereo pair, or one camera, from pictures of a printed chessboard
 ///
 /// Pictures are paired in the order given. Writes left.cahvor and right.cahvor (or .cahv,
 /// .cahvore), report.json and residuals.html into the folder DIR. The models are in the axes of the
-/// left camera (x right, y down, z forward); the scale is that of the squares.
+/// left camera (x right, y down, z forward); the scale is that of the squares. A pair of which one
+/// picture loses more than half of its corners is left out and named. No models are written, and the
+/// command ends with 2, if more than a third of the pairs or a tenth of the corners of the others do
+/// not fit, if a camera errs by more than --max-rms-px, or if the baseline is below 10 sigma.
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct CalibrateArgs {
     /// The board: chessboard:COLSxROWS:SQUARE_M, counting inner corners, e.g. chessboard:9x6:0.025
@@ -37,9 +43,12 @@ pub(super) struct CalibrateArgs {
     /// Camera model
     #[arg(long, value_name = "MODEL", default_value = "cahvor")]
     model: Model,
-    /// Linearity of a CAHVORE model: 1 perspective, 0 fisheye, or between
-    #[arg(long, value_name = "L", default_value_t = 0.0)]
-    linearity: f64,
+    /// Linearity of a CAHVORE model: 1 perspective, 0 fisheye (the default), or between
+    #[arg(long, value_name = "L")]
+    linearity: Option<f64>,
+    /// Largest root mean square error of a camera that is accepted
+    #[arg(long, value_name = "PX", default_value_t = 1.0)]
+    max_rms_px: f64,
     /// Overwrites outputs that exist
     #[arg(long)]
     force: bool,
@@ -102,10 +111,14 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<(), CommandError> {
             args.right.len()
         )));
     }
-    if !(-1.0..=1.0).contains(&args.linearity) {
+    let rules = CalibrationRules {
+        model: kind(args)?,
+        ..CalibrationRules::default()
+    };
+    if !(args.max_rms_px > 0.0) {
         return Err(CommandError::BadInput(format!(
-            "--linearity {}: expected -1 to 1",
-            args.linearity
+            "--max-rms-px {}: expected a number above 0",
+            args.max_rms_px
         )));
     }
     let names: Vec<String> = (0..cameras.len())
@@ -116,50 +129,152 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<(), CommandError> {
     let (report, page) = (open("report.json")?, open("residuals.html")?);
 
     let (sizes_px, views, pictures) = find(&cameras, args.board)?;
-    let rules = CalibrationRules {
-        model: match args.model {
-            Model::Cahv => ModelKind::Cahv,
-            Model::Cahvor => ModelKind::Cahvor,
-            Model::Cahvore => ModelKind::Cahvore {
-                linearity: args.linearity,
-            },
-        },
-        ..CalibrationRules::default()
+    let found = calibrate(&sizes_px, &views, &rules)
+        .map_err(|e| failed(&e, &sizes_px, &views, &pictures, &rules))?;
+    let problems = found.problems(&QualityLimits {
+        max_rms_px: args.max_rms_px,
+        ..QualityLimits::default()
+    });
+    let left_out = report::left_out(&found, &pictures);
+    report.write(&json(&report::account(&found, &pictures, &problems))?)?;
+    page.write(&page::page(&found, &pictures, &problems))?;
+    eprintln!("{}", report::summary(&found));
+    for pair in &left_out {
+        eprintln!("left out: {pair}");
+    }
+    let more = match args.model {
+        Model::Cahv => "--model cahvor describes it",
+        Model::Cahvor => "--model cahvore may describe it",
+        Model::Cahvore => "another --linearity may describe it",
     };
-    let found =
-        calibrate(&sizes_px, &views, &rules).map_err(|e| CommandError::BadInput(e.to_string()))?;
+    for camera in 0..found.cameras.len() {
+        if let Some(word) = report::pattern(&found, camera, more) {
+            eprintln!("{word}");
+        }
+    }
+    if !problems.is_empty() {
+        let problems: Vec<String> = problems.iter().map(ToString::to_string).collect();
+        return Err(CommandError::BadInput(format!(
+            "no models written: {}{}; see report.json and residuals.html in {}",
+            problems.join("; "),
+            alone(&sizes_px, &views, &rules),
+            args.out.display()
+        )));
+    }
     for (output, camera) in models.iter().zip(&found.cameras) {
         let text = write_text(camera, Some(FRAME)).map_err(|e| anyhow!("result: {e}"))?;
         output.write(&text)?;
     }
-    report.write(&json(&account(&found, &sizes_px, &pictures))?)?;
-    page.write(&page::page(&found, &sizes_px))?;
-    for (side, rms_px) in SIDES.iter().zip(&found.rms_px) {
-        eprintln!("{side}: {rms_px:.3} px rms");
-    }
-    eprintln!(
-        "{} corners, {} rejected, sigma {:.3} px; results in {}",
-        found.residuals.len(),
-        found.rejected,
-        found.sigma_px,
-        args.out.display()
-    );
+    eprintln!("results in {}", args.out.display());
     Ok(())
+}
+
+fn kind(args: &CalibrateArgs) -> Result<ModelKind, CommandError> {
+    let bad = |what: String| Err(CommandError::BadInput(what));
+    Ok(match (args.model, args.linearity) {
+        (Model::Cahv, None) => ModelKind::Cahv,
+        (Model::Cahvor, None) => ModelKind::Cahvor,
+        (Model::Cahvore, l) => {
+            let linearity = l.unwrap_or(0.0);
+            if !(-1.0..=1.0).contains(&linearity) {
+                return bad(format!("--linearity {linearity}: expected -1 to 1"));
+            }
+            ModelKind::Cahvore { linearity }
+        }
+        (_, Some(l)) => {
+            return bad(format!(
+                "--linearity {l}: only --model cahvore has a linearity"
+            ));
+        }
+    })
+}
+
+/// A calibration that failed, with the names of the pictures it is about.
+fn failed(
+    error: &CalibrationError,
+    sizes_px: &[[u32; 2]],
+    views: &[BoardView],
+    pictures: &Pictures,
+    rules: &CalibrationRules,
+) -> CommandError {
+    let about: Vec<String> = error.views().iter().map(|v| pictures.of_view(*v)).collect();
+    let about = if about.is_empty() {
+        String::new()
+    } else {
+        format!(" ({})", about.join(", "))
+    };
+    let inner = matches!(
+        error,
+        CalibrationError::Inconsistent { .. } | CalibrationError::NotSettled { .. }
+    );
+    let alone = if inner {
+        alone(sizes_px, views, rules)
+    } else {
+        String::new()
+    };
+    CommandError::BadInput(format!("no models written: {error}{about}{alone}"))
+}
+
+/// How well each camera of a pair calibrates without the other: good pictures in wrong pairs do.
+fn alone(sizes_px: &[[u32; 2]], views: &[BoardView], rules: &CalibrationRules) -> String {
+    if sizes_px.len() < 2 {
+        return String::new();
+    }
+    let limits = QualityLimits::default();
+    let rms_px: Vec<Option<f64>> = (0..2)
+        .map(|camera| {
+            let own: Vec<BoardView> = views
+                .iter()
+                .filter(|view| !view[camera].is_empty())
+                .map(|view| vec![view[camera].clone()])
+                .collect();
+            let found = calibrate(&sizes_px[camera..=camera], &own, rules).ok()?;
+            found.problems(&limits).is_empty().then(|| found.rms_px[0])
+        })
+        .collect();
+    match rms_px.as_slice() {
+        [Some(left), Some(right)] => format!(
+            "; each camera alone fits its pictures (left {left:.3} px rms, right {right:.3} px rms): were \
+             the pictures of a pair taken at the same time, and is their order the same?"
+        ),
+        _ => String::new(),
+    }
 }
 
 /// A picture and what became of it.
 struct Picture {
+    /// The placement of the board; `None` without a board in the pair.
     view: Option<usize>,
     camera: usize,
     path: PathBuf,
     refusal: Option<String>,
+    /// The view that this picture's pair shows once more.
+    repeats: Option<usize>,
+}
+
+/// All pictures, pair by pair.
+struct Pictures {
+    all: Vec<Picture>,
+}
+
+impl Pictures {
+    /// The names of a view's pictures.
+    fn of_view(&self, view: usize) -> String {
+        let names: Vec<String> = self
+            .all
+            .iter()
+            .filter(|p| p.view == Some(view))
+            .map(|p| p.path.display().to_string())
+            .collect();
+        names.join(" + ")
+    }
 }
 
 /// Finds the board in all pictures; a placement that no camera could use is left out.
 fn find(
     cameras: &[&[PathBuf]],
     BoardArg { board, square_m }: BoardArg,
-) -> Result<(Vec<[u32; 2]>, Vec<BoardView>, Vec<Picture>), CommandError> {
+) -> Result<(Vec<[u32; 2]>, Vec<BoardView>, Pictures), CommandError> {
     let mut sizes_px: Vec<Option<[u32; 2]>> = vec![None; cameras.len()];
     let (mut views, mut pictures) = (Vec::new(), Vec::new());
     for n in 0..cameras[0].len() {
@@ -200,6 +315,7 @@ fn find(
                 camera,
                 path: path.into(),
                 refusal,
+                repeats: None,
             });
         }
         if view.iter().any(|points| !points.is_empty()) {
@@ -211,77 +327,32 @@ fn find(
         pictures.extend(shown);
     }
     let sizes_px = sizes_px.into_iter().flatten().collect();
+    let mut pictures = Pictures { all: pictures };
+    let views = once(views, &mut pictures);
     Ok((sizes_px, views, pictures))
 }
 
-/// Cells of the residual map across the image.
-const MAP: [usize; 2] = [8, 6];
-
-/// Mean error and its RMS over the cells of a camera's image; null where no corner was.
-fn map(found: &Calibration, camera: usize, size: [u32; 2]) -> Value {
-    let mut cells = vec![(Vector2::zeros(), 0.0, 0_u32); MAP[0] * MAP[1]];
-    for r in found
-        .residuals
-        .iter()
-        .filter(|r| r.camera == camera && r.used)
-    {
-        let cell = [0, 1].map(|axis| {
-            let share = (r.pixel_px[axis] + 0.5) / f64::from(size[axis]);
-            ((share * MAP[axis] as f64).max(0.0) as usize).min(MAP[axis] - 1)
-        });
-        let cell = &mut cells[cell[1] * MAP[0] + cell[0]];
-        cell.0 += r.error_px;
-        cell.1 += r.error_px.norm_squared();
-        cell.2 += 1;
-    }
-    let value = |(sum, squares, n): &(Vector2<f64>, f64, u32)| match n {
-        0 => Value::Null,
-        n => {
-            let n = f64::from(*n);
-            json!({ "mean_px": [sum.x / n, sum.y / n], "rms_px": (squares / n).sqrt(), "n": n })
+/// The views without those that show a placement of the board once more, which are named.
+fn once(views: Vec<BoardView>, pictures: &mut Pictures) -> Vec<BoardView> {
+    let repeats = repeats(&views);
+    for (view, first) in repeats.iter().enumerate() {
+        if let Some(first) = first {
+            eprintln!(
+                "{} shows the board as {} does: counted once",
+                pictures.of_view(view),
+                pictures.of_view(*first)
+            );
         }
-    };
-    let rows: Vec<Vec<Value>> = cells
-        .chunks(MAP[0])
-        .map(|row| row.iter().map(value).collect())
-        .collect();
-    json!(rows)
-}
-
-fn account(found: &Calibration, sizes_px: &[[u32; 2]], pictures: &[Picture]) -> Value {
-    let sides = &SIDES[..found.cameras.len()];
-    let by_side = |of: &dyn Fn(usize) -> Value| -> Value {
-        sides
-            .iter()
-            .enumerate()
-            .map(|(n, side)| ((*side).to_owned(), of(n)))
-            .collect()
-    };
-    let covariance: Vec<Vec<f64>> = found
-        .covariance
-        .row_iter()
-        .map(|row| row.iter().copied().collect())
-        .collect();
-    json!({
-        "frame": FRAME,
-        "rms_px": by_side(&|n| json!(found.rms_px[n])),
-        "sigma_px": found.sigma_px,
-        "corners": found.residuals.len(),
-        "rejected": found.rejected,
-        "parameters": found.parameters.iter().map(|p| json!({
-            "name": p.name, "value": p.value, "sigma": p.sigma,
-        })).collect::<Vec<_>>(),
-        "covariance": covariance,
-        "residual_map": by_side(&|n| map(found, n, sizes_px[n])),
-        "board_poses": found.camera_from_board.iter().map(|pose| {
-            let (t, q) = (pose.translation.vector, pose.rotation);
-            json!({ "position_m": [t.x, t.y, t.z], "quaternion_wxyz": [q.w, q.i, q.j, q.k] })
-        }).collect::<Vec<_>>(),
-        "pictures": pictures.iter().map(|p| json!({
-            "file": p.path.display().to_string(),
-            "camera": SIDES[p.camera],
-            "view": p.view,
-            "refused": p.refusal,
-        })).collect::<Vec<_>>(),
-    })
+    }
+    let kept: Vec<usize> = (0..views.len()).filter(|n| repeats[*n].is_none()).collect();
+    let now = |view: usize| kept.iter().position(|k| *k == view);
+    for picture in &mut pictures.all {
+        let Some(view) = picture.view else {
+            continue;
+        };
+        picture.repeats = repeats[view].and_then(now);
+        picture.view = now(view);
+    }
+    let is_kept = |(n, view): (usize, BoardView)| repeats[n].is_none().then_some(view);
+    views.into_iter().enumerate().filter_map(is_kept).collect()
 }

@@ -7,6 +7,9 @@ use serde_json::json;
 use std::path::PathBuf;
 
 /// Converts a camera model; what is not exact is fitted and its worst pixel error is printed
+///
+/// The fit makes the worst pixel as good as it can be; the error printed is the largest of rays of
+/// the input imaged by the output and of rays of the output imaged by the input.
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct ConvertArgs {
     /// Model to read; `-` is standard input
@@ -85,7 +88,8 @@ pub(super) fn run(args: &ConvertArgs) -> Result<(), CommandError> {
         limit_px: args.limit_px,
         near_m: args.near_m,
     };
-    let mut loaded = load(&args.input, &rules)?;
+    let mut loaded = load(&args.input, &rules, args.size)?;
+    loaded.report_notes();
     if let Some(size) = args.size {
         if let Some(given) = loaded.file.size_px.filter(|given| *given != size) {
             return Err(CommandError::BadInput(format!(

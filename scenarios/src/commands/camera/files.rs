@@ -5,8 +5,8 @@ use anyhow::Context;
 use rover_cameras::{
     Camera, CameraModel,
     formats::{
-        Conversion, ConversionRules, Family, FormatError, LensCamera, MAX_BYTES, ModelFile, kalibr,
-        opencv, read_text, read_toml, ros, write_text, write_toml,
+        Conversion, ConversionError, ConversionRules, Family, FormatError, LensCamera, MAX_BYTES,
+        ModelFile, kalibr, opencv, read_text, read_toml, ros, write_text, write_toml,
     },
 };
 use std::{
@@ -50,12 +50,21 @@ pub(in crate::commands) struct Loaded {
     pub(in crate::commands) file: ModelFile,
     /// `None` for the formats of the CAHV family itself.
     pub(super) fidelity: Option<Fidelity>,
+    /// What a person should know about how the file was read.
+    notes: Vec<String>,
 }
 
 impl Loaded {
     /// The camera with its image size.
     pub(super) fn camera(&self) -> Result<Camera, CommandError> {
         self.file.camera().map_err(|e| bad(&self.name, &e))
+    }
+
+    /// Says on standard error how the file was read.
+    pub(super) fn report_notes(&self) {
+        for note in &self.notes {
+            eprintln!("{}: {note}", self.name);
+        }
     }
 
     /// The camera, without an image size if the file has none.
@@ -68,32 +77,71 @@ fn bad(name: &str, error: &dyn std::fmt::Display) -> CommandError {
     CommandError::BadInput(format!("{name}: {error}"))
 }
 
-/// Reads a model; one that is not of the CAHV family is converted under `rules`.
-pub(super) fn load(path: &Path, rules: &ConversionRules) -> Result<Loaded, CommandError> {
+/// Reads a model; one that is not of the CAHV family is converted under `rules`. `size_px` is the image
+/// size for a file that does not give it.
+pub(super) fn load(
+    path: &Path,
+    rules: &ConversionRules,
+    size_px: Option<[u32; 2]>,
+) -> Result<Loaded, CommandError> {
     let (path, member) = member(path)?;
     let (name, text) = text(&path)?;
     let format = format_of(&path, &text);
     let fail = |e: FormatError| bad(&name, &e);
-    if member != 0 && format != Format::Kalibr {
-        return Err(bad(&name, &"only a Kalibr chain has a second camera"));
+    if let Some(n) = member
+        && !matches!(format, Format::Kalibr | Format::Opencv)
+    {
+        let why =
+            format!("no camera #{n}: only Kalibr chains and OpenCV stereo files have several");
+        return Err(bad(&name, &why));
     }
+    let mut notes = Vec::new();
     let (file, fidelity) = match format {
         Format::Cahv => (read_text(&text).map_err(fail)?, None),
         Format::Toml => (read_toml(&text).map_err(fail)?, None),
         Format::Ros => {
             let info = ros::read(&text).map_err(fail)?;
-            let frame = info.name.unwrap_or_else(|| OWN_AXES.into());
+            let frame = if info.posed {
+                let at = info.camera.frame_from_camera.translation.vector;
+                notes.push(format!(
+                    "pose by its R and P: {:.6} {:.6} {:.6} m in the axes of the rectified left \
+                     camera ({})",
+                    at.x,
+                    at.y,
+                    at.z,
+                    ros::RECTIFIED
+                ));
+                ros::RECTIFIED.into()
+            } else {
+                info.name.unwrap_or_else(|| OWN_AXES.into())
+            };
             converted(&name, &info.camera, &frame, rules)?
         }
         Format::Opencv => {
-            let camera = opencv::read(&text).map_err(fail)?;
-            converted(&name, &camera, OWN_AXES, rules)?
+            let choice = opencv::Choice {
+                number: member,
+                size_px,
+            };
+            let found = opencv::read_chosen(&text, &choice).map_err(fail)?;
+            if member.is_none() && found.number.is_some() {
+                notes.push(format!(
+                    "the first camera of a pair; the second is {name}#2"
+                ));
+            }
+            if found.number == Some(2) && found.frame != "camera1_optical" {
+                notes.push("no R and T in the file: the second camera is in its own axes".into());
+            }
+            converted(&name, &found.camera, found.frame, rules)?
         }
         Format::Kalibr => {
             let chain = kalibr::read(&text).map_err(fail)?;
+            let member = member.unwrap_or(0);
             let camera = chain.get(member).ok_or_else(|| {
-                let n = chain.len();
-                bad(&name, &format!("no camera {member}: the chain has {n}"))
+                let last = chain.len() - 1;
+                bad(
+                    &name,
+                    &format!("no camera #{member}: the chain has #0 to #{last}"),
+                )
             })?;
             converted(&name, camera, "cam0", rules)?
         }
@@ -103,12 +151,14 @@ pub(super) fn load(path: &Path, rules: &ConversionRules) -> Result<Loaded, Comma
         format,
         file,
         fidelity,
+        notes,
     })
 }
 
 /// Reads a model under the usual rules; a conversion that is not exact is reported.
 pub(in crate::commands) fn load_reported(path: &Path) -> Result<Loaded, CommandError> {
-    let loaded = load(path, &ConversionRules::default())?;
+    let loaded = load(path, &ConversionRules::default(), None)?;
+    loaded.report_notes();
     if let Some(fidelity) = loaded.fidelity.filter(|f| !f.exact) {
         eprintln!(
             "{}: its lens was fitted, {:.2e} px off at worst",
@@ -124,7 +174,7 @@ fn converted(
     frame: &str,
     rules: &ConversionRules,
 ) -> Result<(ModelFile, Option<Fidelity>), CommandError> {
-    let found = camera.to_camera(rules).map_err(|e| bad(name, &e))?;
+    let found = camera.to_camera(rules).map_err(|e| unconverted(name, &e))?;
     let fidelity = fidelity(&found);
     let file = ModelFile {
         frame: Some(frame.to_owned()),
@@ -132,6 +182,21 @@ fn converted(
         model: found.camera.model,
     };
     Ok((file, Some(fidelity)))
+}
+
+/// A failed conversion, with the way to accept a larger error.
+fn unconverted(name: &str, error: &ConversionError) -> CommandError {
+    let ConversionError::TooFar { worst_px, .. } = error else {
+        return bad(name, error);
+    };
+    // The error rounded up to two digits.
+    let unit = 10_f64.powf(worst_px.log10().floor() - 1.0);
+    let enough = (worst_px / unit).ceil() * unit;
+    let digits = usize::from(enough < 10.0) + usize::from(enough < 1.0);
+    bad(
+        name,
+        &format!("{error}; `rover camera convert --limit-px {enough:.digits$}` accepts that"),
+    )
 }
 
 fn fidelity<T>(found: &Conversion<T>) -> Fidelity {
@@ -142,17 +207,18 @@ fn fidelity<T>(found: &Conversion<T>) -> Fidelity {
     }
 }
 
-/// `FILE#1` is the second camera of `FILE`.
-fn member(path: &Path) -> Result<(std::path::PathBuf, usize), CommandError> {
+/// `FILE#N` is the camera that `FILE` itself numbers N: `cam1` of a Kalibr chain, `M2` of an OpenCV
+/// pair.
+fn member(path: &Path) -> Result<(std::path::PathBuf, Option<usize>), CommandError> {
     let whole = path.to_string_lossy();
     match whole.rsplit_once('#') {
         Some((file, number)) if !path.exists() => {
             let n = number
                 .parse()
                 .map_err(|_| bad(&whole, &"expected a camera's number after #, as in FILE#1"))?;
-            Ok((file.into(), n))
+            Ok((file.into(), Some(n)))
         }
-        _ => Ok((path.into(), 0)),
+        _ => Ok((path.into(), None)),
     }
 }
 
@@ -238,7 +304,7 @@ pub(super) fn express(
     let frame = loaded.file.frame.as_deref();
     let as_lens = |families: &[Family]| -> Result<_, CommandError> {
         let found = LensCamera::from_camera(&loaded.camera()?, families, rules)
-            .map_err(|e| bad(&loaded.name, &e))?;
+            .map_err(|e| unconverted(&loaded.name, &e))?;
         let fidelity = fidelity(&found);
         Ok((found.camera, Some(fidelity)))
     };

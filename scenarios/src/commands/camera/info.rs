@@ -30,7 +30,8 @@ pub(super) fn run(args: &InfoArgs) -> Result<(), CommandError> {
         .as_deref()
         .map(|path| Output::open(path, args.force))
         .transpose()?;
-    let loaded = load(&args.model, &ConversionRules::default())?;
+    let loaded = load(&args.model, &ConversionRules::default(), None)?;
+    loaded.report_notes();
     let size = loaded.file.size_px;
     // Without a size the terms are the same; only the field of view is not known.
     let camera = Camera {

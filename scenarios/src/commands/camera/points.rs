@@ -1,12 +1,12 @@
 //! `rover camera project | ray | triangulate`: tables of points and pixels.
 
-use super::files::load_reported;
+use super::files::{Loaded, load_reported};
 use crate::{
     commands::CommandError,
     tables::{Table, TableWriter},
 };
 use nalgebra::{Vector2, Vector3};
-use rover_cameras::{Camera, CameraError, closest_point};
+use rover_cameras::{Camera, CameraError, Ray, closest_point};
 use std::path::PathBuf;
 
 /// Where a table goes.
@@ -41,6 +41,9 @@ pub(super) struct RayArgs {
     model: PathBuf,
     /// Pixels: u_px,v_px
     pixels: PathBuf,
+    /// Also answers pixels that lie outside the image
+    #[arg(long)]
+    beyond_image: bool,
     #[command(flatten)]
     out: OutArgs,
 }
@@ -54,6 +57,9 @@ pub(super) struct TriangulateArgs {
     right: PathBuf,
     /// Matches: ul_px,vl_px,ur_px,vr_px
     matches: PathBuf,
+    /// Also answers pixels that lie outside the images
+    #[arg(long)]
+    beyond_image: bool,
     #[command(flatten)]
     out: OutArgs,
 }
@@ -81,31 +87,49 @@ fn answer_all<const N: usize, const M: usize>(
     Ok(())
 }
 
+/// Refuses a pixel outside the image, if the file gives a size and `beyond_image` is not asked for.
+fn check_inside(
+    loaded: &Loaded,
+    pixel_px: &Vector2<f64>,
+    beyond_image: bool,
+) -> Result<(), CameraError> {
+    let Some([width_px, height_px]) = loaded.file.size_px.filter(|_| !beyond_image) else {
+        return Ok(());
+    };
+    let camera = Camera {
+        model: loaded.model().clone(),
+        width_px,
+        height_px,
+    };
+    if camera.contains(pixel_px, 0.0) {
+        return Ok(());
+    }
+    Err(CameraError::OutsideImage {
+        pixel_px: *pixel_px,
+        width_px,
+        height_px,
+        margin_px: 0.0,
+    })
+}
+
+/// The ray of a pixel of the image.
+fn ray_of(loaded: &Loaded, pixel_px: [f64; 2], beyond_image: bool) -> Result<Ray, CameraError> {
+    let pixel_px = Vector2::from(pixel_px);
+    if !(pixel_px.x + pixel_px.y).is_finite() {
+        return Err(CameraError::NotFinite);
+    }
+    check_inside(loaded, &pixel_px, beyond_image)?;
+    loaded.model().ray(&pixel_px)
+}
+
 /// `rover camera project`.
 pub(super) fn project(args: &ProjectArgs) -> Result<(), CommandError> {
     let loaded = load_reported(&args.model)?;
-    let camera = loaded.camera().ok();
     let project = |[x, y, z]: [f64; 3]| -> Result<[f64; 3], CameraError> {
         let image = loaded
             .model()
             .project_with_jacobian(&Vector3::new(x, y, z))?;
-        if let Some(Camera {
-            width_px,
-            height_px,
-            ..
-        }) = camera
-            && !args.beyond_image
-            && !camera
-                .as_ref()
-                .is_some_and(|c| c.contains(&image.pixel_px, 0.0))
-        {
-            return Err(CameraError::OutsideImage {
-                pixel_px: image.pixel_px,
-                width_px,
-                height_px,
-                margin_px: 0.0,
-            });
-        }
+        check_inside(&loaded, &image.pixel_px, args.beyond_image)?;
         Ok([image.pixel_px.x, image.pixel_px.y, image.range_m])
     };
     answer_all(
@@ -127,10 +151,7 @@ pub(super) fn ray(args: &RayArgs) -> Result<(), CommandError> {
             &["ox_m", "oy_m", "oz_m", "dx", "dy", "dz"],
         ),
         |[u, v]| {
-            let ray = loaded
-                .model()
-                .ray(&Vector2::new(u, v))
-                .map_err(|e| e.to_string())?;
+            let ray = ray_of(&loaded, [u, v], args.beyond_image).map_err(|e| e.to_string())?;
             let (o, d) = (ray.origin, ray.direction);
             Ok([o.x, o.y, o.z, d.x, d.y, d.z])
         },
@@ -157,14 +178,8 @@ pub(super) fn triangulate(args: &TriangulateArgs) -> Result<(), CommandError> {
         ),
         |[ul, vl, ur, vr]| {
             let side = |name: &'static str| move |e: CameraError| format!("{name}: {e}");
-            let first = left
-                .model()
-                .ray(&Vector2::new(ul, vl))
-                .map_err(side("left"))?;
-            let second = right
-                .model()
-                .ray(&Vector2::new(ur, vr))
-                .map_err(side("right"))?;
+            let first = ray_of(&left, [ul, vl], args.beyond_image).map_err(side("left"))?;
+            let second = ray_of(&right, [ur, vr], args.beyond_image).map_err(side("right"))?;
             let found = closest_point(&first, &second).map_err(|e| e.to_string())?;
             let p = found.point;
             Ok([p.x, p.y, p.z, found.miss_m])
