@@ -321,7 +321,7 @@ fn a_point_in_front_that_the_distortion_carries_behind_is_outside_the_field() {
         &Unit::new_normalize(Vector3::new(-0.000_544, 0.003_913, 1.0)),
         [0.0, -0.289_36, 0.097_88],
     );
-    let point = Vector3::new(5.0, -3.0, 0.2);
+    let point = Vector3::new(5.0, 3.0, 0.2);
     let Err(CameraError::OutsideField {
         off_axis_deg,
         limit_deg,
