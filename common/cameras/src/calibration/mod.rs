@@ -33,8 +33,8 @@ use crate::{Camera, CameraError};
 use adjust::Adjustment;
 use nalgebra::{DMatrix, Isometry3, Vector2};
 pub use quality::{
-    CELLS, MAX_PICTURE_REJECTED, PictureFit, QualityLimits, QualityProblem, SAME_PLACEMENT_PX,
-    STRUCTURED_PX, STRUCTURED_SHARE, repeats,
+    CELLS, MAX_PICTURE_REJECTED, PictureFit, QualityLimits, QualityProblem, REJECTED_PX,
+    SAME_PLACEMENT_PX, STRUCTURED_PX, STRUCTURED_SHARE, repeats,
 };
 use quality::{check_pairs, side};
 use rig::Rig;

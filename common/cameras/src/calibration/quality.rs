@@ -11,6 +11,9 @@ pub const SAME_PLACEMENT_PX: f64 = 0.5;
 /// A view is left out if more than this share of the corners of one of its pictures is rejected:
 /// the picture then does not show what the others explain, and its other corners fit by chance.
 pub const MAX_PICTURE_REJECTED: f64 = 0.5;
+/// Rejected corners that are off by less than this do not speak against the pictures, px: where the
+/// others agree to a few hundredths, four sigma are a tenth.
+pub const REJECTED_PX: f64 = 0.5;
 /// Cells of the image, across and down, in which errors are averaged.
 pub const CELLS: [usize; 2] = [8, 6];
 /// Share of the squared error that neighbouring corners have in common from which the model is
@@ -23,7 +26,7 @@ pub const STRUCTURED_PX: f64 = 0.2;
 /// The limits of a calibration that is good enough to be used.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct QualityLimits {
-    /// Largest share of rejected corners in the views that were kept.
+    /// Largest share of rejected corners, off by more than [`REJECTED_PX`], in the views kept.
     pub max_rejected_share: f64,
     /// Largest share of views left out as a whole.
     pub max_dropped_share: f64,
@@ -51,11 +54,12 @@ impl Default for QualityLimits {
 pub enum QualityProblem {
     /// Too many corners do not fit.
     #[error(
-        "{found} of {corners} corners of the pictures kept were rejected, expected at most {:.0} %",
+        "{found} of {corners} corners of the pictures kept were rejected and are off by more than \
+         {REJECTED_PX} px, expected at most {:.0} %",
         100.0 * limit
     )]
     Rejected {
-        /// Corners rejected in the views kept.
+        /// Corners rejected in the views kept that are off by more than [`REJECTED_PX`].
         found: usize,
         /// Corners in the views kept.
         corners: usize,
@@ -314,7 +318,8 @@ impl Calibration {
                 .iter()
                 .filter(|r| !self.dropped.contains(&r.view))
         };
-        let (corners, found) = (kept().count(), kept().filter(|r| !r.used).count());
+        let far = |r: &&super::Residual| !r.used && r.error_px.norm() > REJECTED_PX;
+        let (corners, found) = (kept().count(), kept().filter(far).count());
         if found as f64 > limits.max_rejected_share * corners as f64 {
             all.push(QualityProblem::Rejected {
                 found,

@@ -308,3 +308,41 @@ fn the_written_form_is_stable_and_strict() {
         );
     }
 }
+
+/// A calibration of real pictures: its polynomial rises for ever, but O is tilted, and far out the
+/// distortion carries points behind the image plane.
+#[test]
+fn a_point_in_front_that_the_distortion_carries_behind_is_outside_the_field() {
+    let camera = Camera::pinhole_distorted(
+        &Isometry3::identity(),
+        [533.7; 2],
+        [341.9, 235.3],
+        [640, 480],
+        &Unit::new_normalize(Vector3::new(-0.000_544, 0.003_913, 1.0)),
+        [0.0, -0.289_36, 0.097_88],
+    );
+    let point = Vector3::new(5.0, 3.0, 0.2);
+    let Err(CameraError::OutsideField {
+        off_axis_deg,
+        limit_deg,
+    }) = camera.project(&point)
+    else {
+        panic!("{:?}", camera.project(&point));
+    };
+    // The last point on the way out that has an image.
+    let [axis, _] = camera.model.lens().unwrap();
+    let across = (point - axis * point.dot(axis)).normalize();
+    let seen = |degrees: f64| {
+        let (sine, cosine) = degrees.to_radians().sin_cos();
+        camera.project(&(axis * cosine + across * sine)).is_ok()
+    };
+    let last = (0..9000)
+        .map(|n| f64::from(n) * 0.01)
+        .take_while(|degrees| seen(*degrees))
+        .last()
+        .unwrap();
+    assert!((limit_deg - last).abs() < 0.011, "{limit_deg} {last}");
+    assert!(off_axis_deg > limit_deg && off_axis_deg < 90.0);
+    let behind = camera.project(&Vector3::new(0.0, 0.0, -1.0));
+    assert!(matches!(behind, Err(CameraError::BehindCamera { .. })));
+}
