@@ -115,7 +115,7 @@ pub(super) fn run(args: &CalibrateArgs) -> Result<(), CommandError> {
         model: kind(args)?,
         ..CalibrationRules::default()
     };
-    if !(args.max_rms_px > 0.0) {
+    if args.max_rms_px.is_nan() || args.max_rms_px <= 0.0 {
         return Err(CommandError::BadInput(format!(
             "--max-rms-px {}: expected a number above 0",
             args.max_rms_px
