@@ -80,7 +80,8 @@ mod tests {
         assert_eq!(find(SCENARIOS, "bluestreak.toml"), Some(long));
         assert_eq!(find(SCENARIOS, "./scenarios/bluestreak.toml"), Some(long));
         assert!(find(ROBOTS, "robots/bluestreak.toml").is_some());
-        assert!(find(SCENARIOS, "bluestreak").is_none());
+        assert_eq!(find(SCENARIOS, "bluestreak"), Some(long));
+        assert!(find(SCENARIOS, "blue").is_none() && find(SCENARIOS, "streak.toml").is_none());
         assert!(find(SCENARIOS, DEFAULT_SCENARIO).is_some());
     }
 }
