@@ -7,7 +7,7 @@ use k::nalgebra as other;
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use proptest::prelude::*;
 use rover_kinematics::{AxisGoal, solve_axis};
-use rover_robot::urdf::{ChainOptions, Urdf, UrdfArm};
+use rover_robot::urdf::{ChainOptions, NO_RATE_LIMIT_RAD_S, Urdf, UrdfArm};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -239,12 +239,6 @@ fn what_concerns_the_chain_is_refused_with_its_line() {
         ),
         ("type=\"revolute\"", "type=\"hinge\"", shoulder, "`hinge`"),
         (
-            "velocity=\"0.1\"",
-            "velocity=\"0\"",
-            shoulder,
-            "rate limit 0",
-        ),
-        (
             "upper=\"3.2\"",
             "upper=\"-4\"",
             shoulder,
@@ -315,6 +309,32 @@ fn what_concerns_the_chain_is_refused_with_its_line() {
     );
     let bomb = "<!DOCTYPE r [<!ENTITY a \"aaaa\"><!ENTITY b \"&a;&a;\">]>\n<robot name=\"&b;\"/>";
     assert!(parse(bomb).unwrap_err().starts_with("arm.urdf:1:"));
+}
+
+#[test]
+fn a_joint_without_a_rate_limit_is_said_and_has_none() {
+    let (from, to) = ("velocity=\"0.1\"", "velocity=\"0\"");
+    assert!(FLIGHT_ARM.contains(from));
+    let urdf = parse(&FLIGHT_ARM.replacen(from, to, 1)).unwrap();
+    let found = urdf.arm(&ChainOptions::default()).unwrap();
+    let rates: Vec<f64> = found
+        .arm
+        .limits()
+        .iter()
+        .map(|l| l.max_rate_rad_s)
+        .collect();
+    assert_eq!(rates[0], NO_RATE_LIMIT_RAD_S);
+    assert!(rates[1] < NO_RATE_LIMIT_RAD_S);
+    let said = found
+        .notes
+        .iter()
+        .any(|n| n.message.contains("no rate limit"));
+    assert!(said, "{:?}", found.notes);
+    let given = urdf.arm(&ChainOptions {
+        max_rate_rad_s: Some(0.5),
+        ..Default::default()
+    });
+    assert_eq!(given.unwrap().arm.limits()[0].max_rate_rad_s, 0.5);
 }
 
 /// Neither depth nor length may overrun the reader.
