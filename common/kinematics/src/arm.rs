@@ -45,51 +45,63 @@ pub struct Arm {
     chain_m: f64,
 }
 
-/// Sweeps over the points of a chain, and steps of the search along each axis.
-const CHAIN_SWEEPS: usize = 40;
-const CHAIN_STEPS: usize = 60;
+/// Most sweeps over the points of a chain, and the gain below which one is the last, m.
+const CHAIN_SWEEPS: usize = 200;
+const CHAIN_GAIN_M: f64 = 1e-9;
 
 /// A short chain of points on the axes from the base to the last link's origin, m. Any choice of
 /// points bounds the reach; the best is approached one point at a time (the sum is convex).
 fn chain_m(rows: &[DhRow], tilts_rad: &[f64]) -> f64 {
     let n = rows.len();
-    // from a point on the axis of row i to one on the next axis, both by their places along it
-    let link = |i: usize, here: f64, next: f64| {
-        let (row, tilt) = (&rows[i], tilts_rad.get(i).copied().unwrap_or(0.0));
-        let turn = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), row.alpha_rad)
-            * UnitQuaternion::from_axis_angle(&Vector3::y_axis(), tilt);
-        let start = Vector3::new(row.a_m, 0.0, row.d_m - here);
-        // the last link's origin is a point, not an axis
-        (start + turn * Vector3::z() * if i + 1 < n { next } else { 0.0 }).norm()
+    // where the next axis passes, and which way, seen from an axis; the last link's origin is a
+    // point, not an axis
+    let links: Vec<(Vector3<f64>, Vector3<f64>)> = (0..n)
+        .map(|i| {
+            let (row, tilt) = (&rows[i], tilts_rad.get(i).copied().unwrap_or(0.0));
+            let turn = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), row.alpha_rad)
+                * UnitQuaternion::from_axis_angle(&Vector3::y_axis(), tilt);
+            let along = if i + 1 < n { 1.0 } else { 0.0 };
+            (
+                Vector3::new(row.a_m, 0.0, row.d_m),
+                turn * Vector3::z() * along,
+            )
+        })
+        .collect();
+    let mut places = vec![0.0; n + 1];
+    let length = |places: &[f64]| {
+        let links = links.iter().zip(places.windows(2));
+        let links = links
+            .map(|((at, along), place)| (at + along * place[1] - Vector3::z() * place[0]).norm());
+        places[0].abs() + links.sum::<f64>()
     };
-    let mut places = vec![0.0; n];
-    let around = |places: &[f64], i: usize, here: f64| {
-        let before = match i {
-            0 => here.abs(),
-            _ => link(i - 1, places[i - 1], here),
-        };
-        before + link(i, here, places.get(i + 1).copied().unwrap_or(0.0))
-    };
-    let longest = rows.iter().map(|r| r.a_m.hypot(r.d_m)).sum::<f64>();
+    let mut best = length(&places);
     for _ in 0..CHAIN_SWEEPS {
         for i in 0..n {
-            let (mut low, mut high) = (-longest, longest);
-            for _ in 0..CHAIN_STEPS {
-                let (a, b) = (low + (high - low) / 3.0, high - (high - low) / 3.0);
-                if around(&places, i, a) <= around(&places, i, b) {
-                    high = b;
-                } else {
-                    low = a;
-                }
-            }
-            let better = 0.5 * (low + high);
-            if around(&places, i, better) < around(&places, i, places[i]) {
-                places[i] = better;
+            // the foot on this axis of the point before, and its distance from it
+            let (before, off_before) = if i == 0 {
+                (0.0, 0.0)
+            } else {
+                let (at, along) = links[i - 1];
+                let from_before = at - Vector3::z() * places[i - 1];
+                let foot = -from_before.dot(&along);
+                (foot, (from_before + along * foot).norm())
+            };
+            let (at, along) = links[i];
+            let next = at + along * places[i + 1];
+            let off_next = next.xy().norm();
+            // the shortest way over a line crosses it in proportion to the distances
+            let both = off_before + off_next;
+            if both > 0.0 {
+                places[i] = (before * off_next + next.z * off_before) / both;
             }
         }
+        let now = length(&places);
+        if !(best - now > CHAIN_GAIN_M) {
+            return best.min(now);
+        }
+        best = now;
     }
-    let links = (0..n).map(|i| link(i, places[i], places.get(i + 1).copied().unwrap_or(0.0)));
-    places[0].abs() + links.sum::<f64>()
+    best
 }
 
 /// Axes and origins of all frames, `0..=n`, in the base frame.

@@ -38,7 +38,7 @@ pub use model_error::{
     ERRORS_PER_JOINT, MOUNT_PARAMETERS, point_error_jacobian, pose_error_jacobian,
     pose_error_jacobian_with_mount,
 };
-pub use rows::{ArmError, DhRow, JointLimits};
+pub use rows::{ArmError, DhRow, JointLimits, NO_RATE_LIMIT_RAD_S};
 pub use tool::Tool;
 pub use trajectory::{
     JointTrajectory, Quantity, TimingOptions, TrajectoryError, TrajectoryPoint, through,

@@ -18,6 +18,10 @@ pub struct DhRow {
     pub theta_offset_rad: f64,
 }
 
+/// Rate of a joint without a limit, rad/s. Where joint travel is weighed by rates, such a joint
+/// counts as the slowest of those that have one.
+pub const NO_RATE_LIMIT_RAD_S: f64 = 1e100;
+
 /// What one joint may do.
 #[derive(Serialize, Deserialize, Clone, Debug, PartialEq)]
 #[serde(deny_unknown_fields)]
@@ -26,7 +30,8 @@ pub struct JointLimits {
     pub lower_rad: f64,
     /// Largest joint angle, radians.
     pub upper_rad: f64,
-    /// Largest magnitude of the joint rate, rad/s, positive.
+    /// Largest magnitude of the joint rate, rad/s, positive; [`NO_RATE_LIMIT_RAD_S`] if it has no
+    /// limit.
     pub max_rate_rad_s: f64,
     /// Largest magnitude of the joint acceleration, rad/s^2, positive.
     pub max_acceleration_rad_s2: f64,

@@ -14,7 +14,7 @@ mod convert;
 mod parse;
 mod xml;
 
-pub use chain::{ChainOptions, NO_RATE_LIMIT_RAD_S, UrdfArm};
+pub use chain::{ChainOptions, UrdfArm};
 
 use nalgebra::{Isometry3, Unit, Vector3};
 use std::path::PathBuf;

@@ -6,8 +6,8 @@
 use k::nalgebra as other;
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use proptest::prelude::*;
-use rover_kinematics::{AxisGoal, solve_axis};
-use rover_robot::urdf::{ChainOptions, NO_RATE_LIMIT_RAD_S, Urdf, UrdfArm};
+use rover_kinematics::{AxisGoal, NO_RATE_LIMIT_RAD_S, solve_axis};
+use rover_robot::urdf::{ChainOptions, Urdf, UrdfArm};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 

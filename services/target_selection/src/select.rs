@@ -65,7 +65,7 @@ pub fn is_distant(pair: &CameraPairDescription) -> bool {
 /// # Errors
 /// A fault that says why nothing can be placed there: `pixel_outside_image`, `no_texture`,
 /// `not_unique`, `occluded`, `no_surface_in_range`, `too_close_to_border`, `too_few_points`,
-/// `too_rough`, `normal_facing_away`, `bad_frame`.
+/// `too_rough`, `normal_uncertain`, `normal_facing_away`, `bad_frame`.
 pub fn target_at(
     request: &SelectRequest,
     frame: &StereoFrame,

@@ -14,7 +14,7 @@ mod numeric;
 mod polish;
 
 use crate::arm::{Arm, LIMIT_TOLERANCE_RAD, MAX_JOINTS};
-use crate::rows::ArmError;
+use crate::rows::{ArmError, JointLimits, NO_RATE_LIMIT_RAD_S};
 use crate::tool::Tool;
 pub use family::FamilyMismatch;
 pub use multistart::{all_poses, all_solutions, closest_pose};
@@ -367,11 +367,20 @@ pub fn solve_axis(arm: &Arm, tool: &Tool, goal: &AxisGoal) -> Result<Vec<IkSolut
 /// Seconds that the slowest joint needs from `a` to `b` at its full rate: the distance by which
 /// [`closest_solution`] chooses.
 fn travel_time(arm: &Arm, a: &[f64], b: &[f64]) -> f64 {
+    let rates = arm.limits().iter().map(|l| l.max_rate_rad_s);
+    let slowest = rates.fold(NO_RATE_LIMIT_RAD_S, f64::min);
+    let rate = |l: &JointLimits| {
+        if l.max_rate_rad_s < NO_RATE_LIMIT_RAD_S {
+            l.max_rate_rad_s
+        } else {
+            slowest
+        }
+    };
     let times = a
         .iter()
         .zip(b)
         .zip(arm.limits())
-        .map(|((a, b), l)| (a - b).abs() / l.max_rate_rad_s);
+        .map(|((a, b), l)| (a - b).abs() / rate(l));
     times.fold(0.0, f64::max)
 }
 

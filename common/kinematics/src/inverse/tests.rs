@@ -556,3 +556,18 @@ fn a_joint_limit_found_by_descent_is_named() {
         other => panic!("{other}"),
     }
 }
+
+#[test]
+fn a_joint_without_a_rate_limit_counts_as_the_slowest_that_has_one() {
+    let arm = flight_arm();
+    let mut limits = arm.limits().to_vec();
+    limits[0].max_rate_rad_s = 0.5;
+    for limit in &mut limits[1..] {
+        limit.max_rate_rad_s = 0.25;
+    }
+    limits[4].max_rate_rad_s = NO_RATE_LIMIT_RAD_S;
+    let arm = Arm::new(arm.rows().to_vec(), limits).unwrap();
+    let mut there = [0.0; 5];
+    there[4] = 1.0;
+    assert!((travel_time(&arm, &[0.0; 5], &there) - 4.0).abs() < 1e-12);
+}

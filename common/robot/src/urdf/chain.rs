@@ -3,15 +3,13 @@
 use super::convert::{Line, rows};
 use super::{JointKind, Note, Urdf, UrdfError, UrdfJoint};
 use nalgebra::{Isometry3, Unit, Vector3};
-use rover_kinematics::{Arm, ArmError, JointLimits, MAX_JOINTS, MIN_JOINTS, Tool};
+use rover_kinematics::{
+    Arm, ArmError, JointLimits, MAX_JOINTS, MIN_JOINTS, NO_RATE_LIMIT_RAD_S, Tool,
+};
 use std::f64::consts::TAU;
 
 /// How far a joint without limits may turn to either side, rad.
 const ENDLESS_RAD: f64 = TAU;
-
-/// Rate of a joint without a limit, rad/s. Where joint travel is weighed by rates, such joints
-/// weigh least, and alike among themselves.
-pub const NO_RATE_LIMIT_RAD_S: f64 = 1e100;
 
 /// Which chain, and what the file may lack.
 #[derive(Clone, Debug, Default, PartialEq)]

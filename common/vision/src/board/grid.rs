@@ -61,16 +61,6 @@ pub(super) fn grow(
             if let Some(corners) = grid.board(board) {
                 return Ok(corners);
             }
-            if grid.cells.len() > largest.0 && std::env::var("DBG").is_ok() {
-                for (c, i) in &grid.cells {
-                    eprintln!(
-                        "{c:?} {:?} {}",
-                        grid.points[*i].at.as_slice(),
-                        grid.points[*i].swing
-                    );
-                }
-                eprintln!();
-            }
             if grid.cells.len() > largest.0 {
                 largest = (grid.cells.len(), grid.extent());
             }

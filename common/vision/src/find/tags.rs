@@ -240,9 +240,8 @@ fn measure(
         let pose = pose(camera, side_m, &corners, sigma_px, rules)?;
         // straight diagonals are not straight through a lens: the middle's own image is
         let origin = pose.camera_frame_from_fiducial.translation.vector;
-        if let Ok(middle) = camera.project(&origin) {
-            (finding.u_px, finding.v_px) = (middle.x, middle.y);
-        }
+        let middle = camera.project(&origin).map_err(|_| degenerate())?;
+        (finding.u_px, finding.v_px) = (middle.x, middle.y);
         finding.pose = Some(pose);
     }
     Ok(finding)

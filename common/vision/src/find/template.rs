@@ -9,7 +9,7 @@ use super::warp::{Appearance, Patch, warp};
 use super::{Finding, NoFinding, cut, near, positive};
 use crate::image::{Image8, ImageF};
 use crate::ncc::{Peak, TemplatePyramid, Window, search_peaks};
-use crate::sample::SplineImage;
+use crate::sample::{Grid, SplineImage};
 
 /// Thresholds of the template search.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -254,16 +254,12 @@ fn refine(
     let (mut centre, mut matrix) = (start, Matrix2::<f64>::identity());
     let mut samples = vec![0.0f32; w * h];
     for _ in 0..MAX_STEPS {
-        let first = centre - corner - matrix * Vector2::new(half_u, half_v);
-        let inside = spline.sample_grid(
-            [first.x, first.y],
-            [matrix.m11, matrix.m21],
-            [matrix.m12, matrix.m22],
-            w,
-            h,
-            &mut samples,
-        );
-        if !inside {
+        let grid = Grid {
+            origin: centre - corner - matrix * Vector2::new(half_u, half_v),
+            step_u: matrix.column(0).into(),
+            step_v: matrix.column(1).into(),
+        };
+        if !spline.sample_grid(&grid, w, h, w, &mut samples) {
             return border_peak(patch, peak, patch_variance, &rows, rules).ok_or_else(outside);
         }
         let mut right_side = SVector::<f64, 10>::zeros();

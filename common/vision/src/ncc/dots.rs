@@ -3,6 +3,7 @@
 #[cfg(target_arch = "x86_64")]
 use super::{
     LANES,
+    masked::total,
     narrow::{self, POSITIONS, WIDE_POSITIONS},
 };
 use super::{SearchImage, Template};
@@ -70,8 +71,7 @@ pub(super) unsafe fn dots_sse2(
     out: &mut [i32],
 ) {
     use std::arch::x86_64::{
-        __m128i, _mm_add_epi32, _mm_cvtsi128_si32, _mm_loadu_si128, _mm_madd_epi16,
-        _mm_setzero_si128, _mm_shuffle_epi32,
+        __m128i, _mm_add_epi32, _mm_loadu_si128, _mm_madd_epi16, _mm_setzero_si128,
     };
     for (i, o) in out.iter_mut().enumerate() {
         // SAFETY: as the caller guarantees.
@@ -88,12 +88,14 @@ pub(super) unsafe fn dots_sse2(
                 a = a.wrapping_add(template.stride);
                 line = line.wrapping_add(image.stride);
             }
-            sum = _mm_add_epi32(sum, _mm_shuffle_epi32(sum, 0b01_00_11_10));
-            sum = _mm_add_epi32(sum, _mm_shuffle_epi32(sum, 0b10_11_00_01));
-            *o = _mm_cvtsi128_si32(sum);
+            *o = total(sum);
         }
     }
 }
+
+/// Positions that [`dots_avx2`] works out together, so that each template value is read once for all.
+#[cfg(target_arch = "x86_64")]
+const TOGETHER: usize = 4;
 
 /// # Safety
 /// The processor must have AVX2; for every position `start + i` and every template row,
@@ -106,44 +108,70 @@ pub(super) unsafe fn dots_avx2(
     start: usize,
     out: &mut [i32],
 ) {
+    let (fours, rest) = out.as_chunks_mut::<TOGETHER>();
+    let done = fours.len() * TOGETHER;
+    for (k, four) in fours.iter_mut().enumerate() {
+        // SAFETY: as the caller guarantees.
+        *four = unsafe { neighbours_avx2(template, image, start + k * TOGETHER) };
+    }
+    for (i, o) in rest.iter_mut().enumerate() {
+        // SAFETY: as the caller guarantees.
+        [*o] = unsafe { neighbours_avx2(template, image, start + done + i) };
+    }
+}
+
+/// Sums of products at N neighbouring positions.
+///
+/// # Safety
+/// As for [`dots_avx2`], for N positions from `start` on.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+unsafe fn neighbours_avx2<const N: usize>(
+    template: &Template,
+    image: &SearchImage,
+    start: usize,
+) -> [i32; N] {
     use std::arch::x86_64::{
-        __m128i, __m256i, _mm_add_epi32, _mm_cvtsi128_si32, _mm_loadu_si128, _mm_madd_epi16,
-        _mm_setzero_si128, _mm_shuffle_epi32, _mm256_add_epi32, _mm256_castsi256_si128,
-        _mm256_extracti128_si256, _mm256_loadu_si256, _mm256_madd_epi16, _mm256_setzero_si256,
+        __m128i, __m256i, _mm_add_epi32, _mm_loadu_si128, _mm_madd_epi16, _mm_setzero_si128,
+        _mm256_add_epi32, _mm256_castsi256_si128, _mm256_extracti128_si256, _mm256_loadu_si256,
+        _mm256_madd_epi16, _mm256_setzero_si256,
     };
-    let (wide, odd) = (
-        template.stride / 16 * 16,
-        !template.stride.is_multiple_of(16),
-    );
-    for (i, o) in out.iter_mut().enumerate() {
+    let stride = template.stride;
+    let (wide, is_odd) = (stride / 16 * 16, !stride.is_multiple_of(16));
+    let mut sums = [_mm256_setzero_si256(); N];
+    let mut rests = [_mm_setzero_si128(); N];
+    let mut a = template.values.as_ptr();
+    let mut line = image.values.as_ptr().wrapping_add(start);
+    for _ in 0..template.height {
         // SAFETY: as the caller guarantees.
         unsafe {
-            let mut sum = _mm256_setzero_si256();
-            let mut rest = _mm_setzero_si128();
-            let mut a = template.values.as_ptr();
-            let mut line = image.values.as_ptr().add(start + i);
-            for _ in 0..template.height {
-                for k in (0..wide).step_by(16) {
-                    let t = _mm256_loadu_si256(a.add(k).cast::<__m256i>());
-                    let p = _mm256_loadu_si256(line.add(k).cast::<__m256i>());
-                    sum = _mm256_add_epi32(sum, _mm256_madd_epi16(t, p));
+            let mut k = 0;
+            while k < wide {
+                let t = _mm256_loadu_si256(a.add(k).cast::<__m256i>());
+                for (i, sum) in sums.iter_mut().enumerate() {
+                    let p = _mm256_loadu_si256(line.add(k + i).cast::<__m256i>());
+                    *sum = _mm256_add_epi32(*sum, _mm256_madd_epi16(t, p));
                 }
-                if odd {
-                    let t = _mm_loadu_si128(a.add(wide).cast::<__m128i>());
-                    let p = _mm_loadu_si128(line.add(wide).cast::<__m128i>());
-                    rest = _mm_add_epi32(rest, _mm_madd_epi16(t, p));
-                }
-                a = a.wrapping_add(template.stride);
-                line = line.wrapping_add(image.stride);
+                k += 16;
             }
-            let halves = _mm_add_epi32(
-                _mm256_castsi256_si128(sum),
-                _mm256_extracti128_si256(sum, 1),
-            );
-            let mut sum = _mm_add_epi32(halves, rest);
-            sum = _mm_add_epi32(sum, _mm_shuffle_epi32(sum, 0b01_00_11_10));
-            sum = _mm_add_epi32(sum, _mm_shuffle_epi32(sum, 0b10_11_00_01));
-            *o = _mm_cvtsi128_si32(sum);
+            if is_odd {
+                let t = _mm_loadu_si128(a.add(wide).cast::<__m128i>());
+                for (i, rest) in rests.iter_mut().enumerate() {
+                    let p = _mm_loadu_si128(line.add(wide + i).cast::<__m128i>());
+                    *rest = _mm_add_epi32(*rest, _mm_madd_epi16(t, p));
+                }
+            }
         }
+        a = a.wrapping_add(stride);
+        line = line.wrapping_add(image.stride);
     }
+    let mut out = [0; N];
+    for ((o, sum), rest) in out.iter_mut().zip(sums).zip(rests) {
+        let halves = _mm_add_epi32(
+            _mm256_castsi256_si128(sum),
+            _mm256_extracti128_si256(sum, 1),
+        );
+        *o = total(_mm_add_epi32(halves, rest));
+    }
+    out
 }

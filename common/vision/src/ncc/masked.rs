@@ -143,7 +143,7 @@ unsafe fn sums_avx2(image: &SearchImage, template: &Template, start: usize) -> [
 /// The sum of four numbers.
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
-fn total(x: std::arch::x86_64::__m128i) -> i32 {
+pub(super) fn total(x: std::arch::x86_64::__m128i) -> i32 {
     use std::arch::x86_64::{_mm_add_epi32, _mm_cvtsi128_si32, _mm_shuffle_epi32};
     // SAFETY: SSE2 belongs to every x86-64.
     unsafe {

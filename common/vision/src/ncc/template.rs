@@ -1,5 +1,7 @@
 //! The template: zero-mean values in whole numbers, with a mask.
 
+use std::borrow::Cow;
+
 use super::LANES;
 use crate::image::Image8;
 
@@ -54,10 +56,12 @@ pub struct Template {
     pub(super) norm: f64,
 }
 
-/// Rounds half up; the argument is within +-4097.
+/// Rounds to the nearest whole number, half to even; the argument is within +-4097. A sum that
+/// pushes the fraction out of the significand: unlike a cast, vectors have it.
 #[inline(always)]
 fn round_to_i16(x: f32) -> i16 {
-    ((x + 8192.5) as i32 - 8192) as i16
+    const PUSH: f32 = 12_582_912.0; // 1.5 * 2^23, whose lowest bits are 0
+    (x + PUSH).to_bits() as i16
 }
 
 /// The runs of `true` in each row.
@@ -150,10 +154,15 @@ impl Template {
             });
         }
         let run = |s: &Span| s.row * width + s.start..s.row * width + s.end;
-        let mut chosen = Vec::with_capacity(count);
-        for s in &spans {
-            chosen.extend_from_slice(&values[run(s)]);
-        }
+        let chosen: Cow<[f32]> = if count == values.len() {
+            values.into()
+        } else {
+            spans
+                .iter()
+                .flat_map(|s| &values[run(s)])
+                .copied()
+                .collect()
+        };
         let n = count as f64;
         let mean = sums(&chosen, |x| [x, 0.0])[0] / n;
         let [size_sum, square_sum] = sums(&chosen, |x| [(x - mean).abs(), (x - mean) * (x - mean)]);

@@ -6,6 +6,7 @@ use rover_cameras::Camera;
 use super::link::Link;
 use super::{MatchFailure, MatchRules, PreparedImage};
 use crate::ncc::{Template, score_map};
+use crate::sample::{CHUNK, Grid};
 
 /// A place on the epipolar curve that looks like the window around the pixel.
 #[derive(Clone, Copy, Debug)]
@@ -43,20 +44,20 @@ fn stops(
     let count = (length.ceil() as usize).clamp(2, 4096);
     let half = f64::from(rules.half_search_window_px);
     let mut list: Vec<Stop> = Vec::with_capacity(count + 1);
+    let step = 1.0 / count as f64;
     for k in 0..=count {
-        let s = k as f64 / count as f64;
+        let s = k as f64 * step;
         let (w0, w1, w2) = (
             (2.0 * s - 1.0) * (s - 1.0),
             4.0 * s * (1.0 - s),
             s * (2.0 * s - 1.0),
         );
         let p = p0 * w0 + p1 * w1 + p2 * w2;
-        let (u, v) = (p.x.round(), p.y.round());
-        let fits = |x: f64, size: u32| x >= half && x + half <= f64::from(size) - 1.0;
-        if !(fits(u, image.width_px) && fits(v, image.height_px)) {
+        let fits = |x: f64, size: u32| x >= half - 0.5 && x + half < f64::from(size) - 0.5;
+        if !(fits(p.x, image.width_px) && fits(p.y, image.height_px)) {
             continue;
         }
-        let (u, v) = (u as usize, v as usize);
+        let (u, v) = ((p.x + 0.5) as usize, (p.y + 0.5) as usize); // the nearest pixel
         if list.last().is_none_or(|last| (last.u, last.v) != (u, v)) {
             list.push(Stop {
                 u,
@@ -123,7 +124,7 @@ pub(super) fn search(
         }
     };
     let half = rules.half_search_window_px as usize;
-    let mut values = vec![0.0f32; (2 * half + 1).pow(2)];
+    let mut values = vec![0.0f32; (2 * half + 1).pow(2) + CHUNK];
     let mut best: Vec<(f32, usize)> = vec![(-1.0, 0); stops.len()];
     let mut active = vec![true; stops.len()];
     let mut any = false;
@@ -167,17 +168,13 @@ fn warped_template(
 ) -> Option<Template> {
     let inverse = matrix.try_inverse()?;
     let side = 2 * half + 1;
-    let origin = pixel - inverse * Vector2::repeat(half as f64);
-    let inside = from.spline.sample_grid(
-        [origin.x, origin.y],
-        [inverse.m11, inverse.m21],
-        [inverse.m12, inverse.m22],
-        side,
-        side,
-        values,
-    );
-    if inside {
-        Template::new(side, side, values, None).ok()
+    let grid = Grid {
+        origin: pixel - inverse * Vector2::repeat(half as f64),
+        step_u: inverse.column(0).into(),
+        step_v: inverse.column(1).into(),
+    };
+    if from.spline.sample_grid(&grid, side, side, side, values) {
+        Template::new(side, side, &values[..side * side], None).ok()
     } else {
         None
     }

@@ -10,8 +10,9 @@
 use nalgebra::{SMatrix, SVector, Vector2};
 
 use super::link::Link;
-use super::window::{Gradients, LeftWindow, dot};
+use super::window::{Gradients, LeftWindow, Overlap, dots};
 use super::{MatchFailure, MatchRules, PreparedImage};
+use crate::sample::Grid;
 
 /// Where a fit starts and what it ends with, relative to a [`Link`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -22,6 +23,50 @@ pub(super) struct Displacement {
     pub slopes: Vector2<f64>,
     /// Across the epipolar direction, px.
     pub across_px: f64,
+}
+
+impl Displacement {
+    /// Where the right image shows the window's pixels.
+    fn grid(&self, link: &Link, window: &LeftWindow) -> Grid {
+        let matrix = link.matrix(&self.slopes);
+        let shift = link.along * self.along_px + link.across * self.across_px;
+        Grid {
+            origin: link.at + matrix * window.first + shift,
+            step_u: matrix.column(0).into(),
+            step_v: matrix.column(1).into(),
+        }
+    }
+
+    /// Adds a step, cut where it is so large that the linear fit cannot hold.
+    fn go(&mut self, step: &Self) {
+        self.along_px += step.along_px.clamp(-1.0, 1.0);
+        self.slopes += step.slopes.map(|s| s.clamp(-0.3, 0.3));
+        self.across_px += step.across_px.clamp(-1.0, 1.0);
+    }
+
+    /// How far a step moves the middle or the edge of a window of this half side, px.
+    fn size_px(&self, half: f64) -> f64 {
+        let middle = self.along_px.abs().max(self.across_px.abs());
+        middle.max(half * self.slopes.amax())
+    }
+
+    /// Whether a fit has stayed near its start and on a surface that is not too steep.
+    fn check(&self, start: &Self, rules: &MatchRules) -> Result<(), MatchFailure> {
+        let moved_px = (self.along_px - start.along_px).abs();
+        if !(moved_px <= rules.max_correction_px) {
+            return Err(MatchFailure::Diverged {
+                moved_px,
+                limit_px: rules.max_correction_px,
+            });
+        }
+        if !(self.slopes.amax() <= rules.max_slope) {
+            return Err(MatchFailure::TooSteep {
+                slope: self.slopes.amax(),
+                limit: rules.max_slope,
+            });
+        }
+        Ok(())
+    }
 }
 
 /// A finished fit.
@@ -69,10 +114,17 @@ type Normal = SMatrix<f64, 6, 6>;
 /// Derivatives by the four geometric parameters, one padded plane each, and the normal matrix.
 struct Derivatives {
     slopes: Vector2<f64>,
-    /// The epipolar direction in the left image.
-    along: Vector2<f64>,
+    /// The derivatives along the epipolar direction beside the true ones.
+    overlap: Overlap,
     planes: [Vec<f32>; 4],
     factor: nalgebra::linalg::Cholesky<f64, nalgebra::Const<6>>,
+}
+
+/// The columns of the linear fit: four derivatives, gain and offset.
+#[inline(always)]
+fn columns<'a>(planes: &'a [Vec<f32>; 4], window: &'a LeftWindow) -> [&'a [f32]; 6] {
+    let [a, b, c, d] = planes;
+    [a, b, c, d, &window.values, &window.ones]
 }
 
 impl Derivatives {
@@ -91,39 +143,26 @@ impl Derivatives {
         let (bu, bv) = (across.x as f32, across.y as f32);
         let scale = 1.0 / window.half as f32;
         let (fu, fv) = (window.first.x as f32 * scale, window.first.y as f32 * scale);
-        let length = window.values.len();
-        let mut planes = [
-            vec![0.0; length],
-            vec![0.0; length],
-            vec![0.0; length],
-            vec![0.0; length],
-        ];
-        for j in 0..window.side {
+        let (length, stride) = (window.values.len(), window.stride);
+        let mut planes = [(); 4].map(|()| vec![0.0f32; length]);
+        // the gradients in the padding are zero, and so are the derivatives
+        let rows = (0..length).step_by(stride).map(|at| at..at + stride);
+        for (j, row) in rows.enumerate() {
             let dv = fv + j as f32 * scale;
-            for i in 0..window.side {
-                let at = j * window.stride + i;
-                let (gu, gv) = (gradients.u[at], gradients.v[at]);
-                let e = au * gu + av * gv;
-                planes[0][at] = e;
-                planes[1][at] = e * (fu + i as f32 * scale);
-                planes[2][at] = e * dv;
-                planes[3][at] = bu * gu + bv * gv;
+            let (gu, gv) = (&gradients.u[row.clone()], &gradients.v[row.clone()]);
+            let [p, q, r, s] = planes.each_mut().map(|plane| &mut plane[row.clone()]);
+            for i in 0..stride {
+                let e = au * gu[i] + av * gv[i];
+                p[i] = e;
+                q[i] = e * (fu + i as i32 as f32 * scale);
+                r[i] = e * dv;
+                s[i] = bu * gu[i] + bv * gv[i];
             }
         }
-        let all: [&[f32]; 6] = [
-            &planes[0],
-            &planes[1],
-            &planes[2],
-            &planes[3],
-            &window.values,
-            &window.ones,
-        ];
+        let all = columns(&planes, window);
         let mut normal = Normal::zeros();
-        for p in 0..6 {
-            for q in p..6 {
-                normal[(p, q)] = dot(all[p], all[q]);
-                normal[(q, p)] = normal[(p, q)];
-            }
+        for (p, one) in all.iter().enumerate() {
+            normal.set_column(p, &dots(all, one).into());
         }
         normal[(3, 3)] += hold;
         // a window without gradient along one slope must not fail, only not move
@@ -132,7 +171,7 @@ impl Derivatives {
         }
         Some(Self {
             slopes,
-            along,
+            overlap: window.overlap(&planes[0], gradients, &along),
             planes,
             factor: normal.cholesky()?,
         })
@@ -184,8 +223,7 @@ fn refine_plain(
     let half = window.half as f64;
     let count = window.side * window.side;
     let mut now = start;
-    let mut samples = vec![0.0f32; count];
-    let mut padded = vec![0.0f32; window.values.len()];
+    let mut samples = vec![0.0f32; window.values.len()];
     let mut quieter: Option<Gradients> = None;
     let mut is_noise_settled = false;
     let mut last_size = 0.0;
@@ -198,33 +236,16 @@ fn refine_plain(
                 Derivatives::new(window, gradients, link, now.slopes, hold).ok_or_else(singular)?
             }
         };
-        let matrix = link.matrix(&now.slopes);
-        let origin = link.at
-            + matrix * window.first
-            + link.along * now.along_px
-            + link.across * now.across_px;
-        let inside = right.spline.sample_grid(
-            [origin.x, origin.y],
-            [matrix.m11, matrix.m21],
-            [matrix.m12, matrix.m22],
-            window.side,
-            window.side,
-            &mut samples,
-        );
-        if !inside {
+        let (grid, side) = (now.grid(link, window), window.side);
+        let right = &right.spline;
+        if !right.sample_grid(&grid, side, side, window.stride, &mut samples) {
             return Err(MatchFailure::CurveOutsideImage);
         }
-        window.pad(&samples, &mut padded);
-        let d = &derived.planes;
-        let (cross, sum) = (dot(&window.values, &padded), dot(&window.ones, &padded));
-        let mut right_side = SVector::<f64, 6>::from([
-            dot(&d[0], &padded),
-            dot(&d[1], &padded),
-            dot(&d[2], &padded),
-            dot(&d[3], &padded),
-            cross,
-            sum,
-        ]);
+        window.centre(&mut samples);
+        let [a, b, c, d, values, ones] = columns(&derived.planes, window);
+        let sums = dots([a, b, c, d, values, ones, &samples], &samples);
+        let [a, b, c, d, cross, sum, square] = sums;
+        let mut right_side = SVector::<f64, 6>::from([a, b, c, d, cross, sum]);
         right_side[3] += now.across_px * hold;
         let x = derived.factor.solve(&right_side);
         let gain = x[4];
@@ -236,12 +257,10 @@ fn refine_plain(
         }
         // the residual is noise of both windows
         let n = count as f64;
-        let square = dot(&padded, &padded);
         let residual = (square - x.dot(&right_side)).max(0.0) / (n - 6.0);
         let noise_square = residual / (RESAMPLED_NOISE + gain * gain);
         let felt = noise_square * (1.0 + gain * gain);
-        let along = &derived.along;
-        let inflation = window.inflation(&d[0], gradients, along, noise_square);
+        let inflation = derived.overlap.inflation(noise_square);
         // the noise of the left values takes as much from the gain
         let gain = gain / window.signal_part(noise_square);
         if !is_noise_settled && inflation > NOISY && taken >= FIRST_STEPS {
@@ -262,27 +281,9 @@ fn refine_plain(
             slopes: Vector2::new(-x[1], -x[2]) / (gain * half) * part,
             across_px: -x[3] / gain * part,
         };
-        now.along_px += step.along_px.clamp(-1.0, 1.0);
-        now.slopes += step.slopes.map(|s| s.clamp(-0.3, 0.3));
-        now.across_px += step.across_px.clamp(-1.0, 1.0);
-        let moved = (now.along_px - start.along_px).abs();
-        if !(moved <= rules.max_correction_px) {
-            return Err(MatchFailure::Diverged {
-                moved_px: moved,
-                limit_px: rules.max_correction_px,
-            });
-        }
-        if !(now.slopes.amax() <= rules.max_slope) {
-            return Err(MatchFailure::TooSteep {
-                slope: now.slopes.amax(),
-                limit: rules.max_slope,
-            });
-        }
-        let size = step
-            .along_px
-            .abs()
-            .max(step.across_px.abs())
-            .max(half * step.slopes.amax());
+        now.go(&step);
+        now.check(&start, rules)?;
+        let size = step.size_px(half);
         let shrinking = size / last_size;
         let is_next_settled = shrinking < 1.0
             && size < NEARLY_SETTLED_PX

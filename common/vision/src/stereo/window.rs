@@ -16,15 +16,24 @@ pub(super) const LANES: usize = 8;
 /// Dot product with a fixed order of summation. Lengths are equal multiples of [`LANES`].
 #[inline(always)]
 pub(super) fn dot(a: &[f32], b: &[f32]) -> f64 {
-    let mut sums = [0.0f32; LANES];
-    for (a, b) in a.chunks_exact(LANES).zip(b.chunks_exact(LANES)) {
-        for ((s, x), y) in sums.iter_mut().zip(a).zip(b) {
-            *s += x * y;
+    dots([a], b)[0]
+}
+
+/// The [`dot`] products of several vectors with one: their sums need not wait for each other.
+#[inline(always)]
+pub(super) fn dots<const N: usize>(several: [&[f32]; N], one: &[f32]) -> [f64; N] {
+    let mut sums = [[0.0f32; LANES]; N];
+    let length = one.len() / LANES;
+    let (one, _) = one.as_chunks::<LANES>();
+    let several = several.map(|a| &a.as_chunks::<LANES>().0[..length]);
+    for k in 0..length {
+        for (sums, a) in sums.iter_mut().zip(&several) {
+            for l in 0..LANES {
+                sums[l] += a[k][l] * one[k][l];
+            }
         }
     }
-    f64::from(
-        ((sums[0] + sums[4]) + (sums[1] + sums[5])) + ((sums[2] + sums[6]) + (sums[3] + sums[7])),
-    )
+    sums.map(|s| f64::from(((s[0] + s[4]) + (s[1] + s[5])) + ((s[2] + s[6]) + (s[3] + s[7]))))
 }
 
 /// The left window: values and gradients at whole pixels around a pixel, in rows padded with
@@ -58,6 +67,30 @@ pub(super) struct Gradients {
     /// What white noise of variance 1 adds to the mean product with the spline's gradients in one
     /// direction.
     noise_in_common: f64,
+}
+
+/// What a set of derivatives holds of the true ones, with which noise.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Overlap {
+    /// d.d
+    own: f64,
+    /// d.e with the spline's own derivatives e.
+    common: f64,
+    /// What white noise of variance 1 adds to `common`.
+    noise_in_common: f64,
+}
+
+impl Overlap {
+    /// (d.d) / (d.g) with the true derivatives g, for noise of this variance, DN^2.
+    pub fn inflation(&self, noise_square: f64) -> f64 {
+        let noise = noise_square * self.noise_in_common;
+        let signal = (self.common - noise).max((1.0 - MOST_NOISE) * self.common);
+        if signal > 0.0 {
+            (self.own / signal).max(0.2)
+        } else {
+            1.0
+        }
+    }
 }
 
 /// Of the spline's gradient at a pixel with itself: the sum of the squares of its weights,
@@ -227,37 +260,24 @@ impl<'a> LeftWindow<'a> {
         })
     }
 
-    /// (d.d) / (d.g) of the derivatives `d` along `direction` (in the left image) that were made
-    /// from `gradients`, for noise of this variance, DN^2.
-    pub fn inflation(
-        &self,
-        d: &[f32],
-        gradients: &Gradients,
-        direction: &Vector2<f64>,
-        noise_square: f64,
-    ) -> f64 {
-        let own = dot(d, d);
+    /// What derivatives `d` along `direction` (in the left image) that were made from `gradients`
+    /// have in common with the window's own.
+    #[inline(always)]
+    pub fn overlap(&self, d: &[f32], gradients: &Gradients, direction: &Vector2<f64>) -> Overlap {
         let e = &self.exact;
-        let common = direction.x * dot(d, &e.u) + direction.y * dot(d, &e.v);
-        let noise =
-            self.count() * noise_square * gradients.noise_in_common * direction.norm_squared();
-        let signal = (common - noise).max((1.0 - MOST_NOISE) * common);
-        if signal > 0.0 {
-            (own / signal).max(0.2)
-        } else {
-            1.0
+        let [own, by_u, by_v] = dots([d, &e.u, &e.v], d);
+        Overlap {
+            own,
+            common: direction.x * by_u + direction.y * by_v,
+            noise_in_common: self.count() * gradients.noise_in_common * direction.norm_squared(),
         }
     }
 
-    /// Copies samples of the window, less the left window's mean, into padded rows.
-    pub fn pad(&self, samples: &[f32], padded: &mut [f32]) {
-        let lines = samples
-            .chunks_exact(self.side)
-            .zip(padded.chunks_exact_mut(self.stride));
-        for (line, out) in lines {
-            for (o, x) in out.iter_mut().zip(line) {
-                *o = x - self.mean;
-            }
+    /// Takes the left window's mean off samples in padded rows and empties the padding.
+    #[inline(always)]
+    pub fn centre(&self, samples: &mut [f32]) {
+        for (x, one) in samples.iter_mut().zip(&self.ones) {
+            *x = if *one > 0.0 { *x - self.mean } else { 0.0 };
         }
     }
 }
@@ -296,7 +316,7 @@ mod tests {
         let mut found = Vec::new();
         for gradients in std::iter::once(exact).chain(smoothed) {
             let d = &gradients.u;
-            let stated = window.inflation(d, &gradients, &direction, 64.0);
+            let stated = window.overlap(d, &gradients, &direction).inflation(64.0);
             let measured = dot(d, d) / dot(d, &truth.exact.u);
             println!("(d.d) / (d.g): {stated:.3} stated, {measured:.3} measured");
             assert!((stated / measured - 1.0).abs() < 0.2, "{stated} {measured}");

@@ -260,8 +260,9 @@ fn row_of<L: Lanes, const BLOCKS: usize>(
         for (sum, near) in sums.iter().zip(near) {
             second = second.lesser(L::load(sum).or(L::load(near)));
         }
-        let margin = 100 + rules.uniqueness_percent;
-        if u32::from(least(second)) * 100 < u32::from(best) * margin {
+        let (second, margin) = (least(second), 100 + rules.uniqueness_percent);
+        // what fits as well elsewhere is not unique, however well it fits
+        if second == best || u32::from(second) * 100 < u32::from(best) * margin {
             continue;
         }
         let sum = |d: usize| i32::from(sums[d / LANES][d % LANES]);

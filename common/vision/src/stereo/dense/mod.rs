@@ -36,7 +36,8 @@ pub struct DenseRules {
     pub min_texture_dn: u32,
     /// Half the side of the window of the plane through neighbours, less half a pixel; 0 for none.
     pub half_plane_px: u32,
-    /// Neighbours within this of a pixel's disparity agree with it, px.
+    /// A pair of opposite neighbours agrees with a pixel if their differences from its disparity add
+    /// up to no more, px (those of a slope cancel).
     pub agreement_px: f32,
     /// Connected regions of fewer pixels are dropped.
     pub min_region_px: u32,

@@ -4,9 +4,10 @@
 use super::{Disparity, NONE};
 
 /// Replaces every disparity by the value that the least-squares plane through its window takes
-/// there, if at least half of the window's pixels agree with it (differ by at most `agreement`
-/// steps per window half). Windows are symmetric about their pixel, and a missing or disagreeing
-/// pixel takes its mirror image out too, so the plane's value in the middle is the mean.
+/// there, if at least a quarter of the window's pixels agree. Windows are symmetric about their
+/// pixel, and pixels agree in pairs of opposite ones, whose differences from the middle are
+/// `agreement` steps at most in sum (those of a slope cancel): so the plane's value in the middle is
+/// the mean.
 ///
 /// `agreement` times the pairs of a window must not exceed 16 bits; disparities are not negative.
 pub(super) fn smooth(disparity: &mut Disparity, half: usize, agreement: i16) {

@@ -124,6 +124,48 @@ fn nothing_is_claimed_without_texture_or_for_unrelated_images() {
     );
 }
 
+#[test]
+fn what_repeats_itself_has_no_disparity() {
+    let stripes = |shift: u32| {
+        let grey = |u: u32| [40, 90, 200, 160, 70][((u + shift) / 4 % 5) as usize];
+        let pixels = (0..240 * 60).map(|i| grey(i % 240)).collect();
+        Image8::from_raw(240, 60, pixels).unwrap()
+    };
+    for uniqueness_percent in [0, 8] {
+        let rules = DenseRules {
+            uniqueness_percent,
+            ..DenseRules::default()
+        };
+        let found = dense_disparity(&stripes(0), &stripes(6), &rules).unwrap();
+        // right of column 64 a whole period or more is searched
+        let wrong = (0..60).flat_map(|v| (70..240).map(move |u| (u, v)));
+        assert_eq!(wrong.filter(|&(u, v)| found.at(u, v).is_some()).count(), 0);
+    }
+}
+
+#[test]
+fn a_plane_needs_a_quarter_of_its_window() {
+    let (w, h, half) = (7, 7, 3);
+    // one disparity off the plane in the middle, and so many pairs on the plane
+    let smoothed = |pairs: usize| {
+        let mut held = vec![NONE; w * h];
+        held[24] = 640 + 30;
+        for k in 0..pairs {
+            held[k] = 640;
+            held[48 - k] = 640;
+        }
+        let mut disparity = Disparity {
+            width_px: w as u32,
+            height_px: h as u32,
+            held,
+        };
+        smoothing::smooth(&mut disparity, half, 96);
+        disparity.held[24]
+    };
+    assert_eq!(smoothed(5), 670);
+    assert_eq!(smoothed(6), 640 + 2); // 30 / 13
+}
+
 /// The same rules pixel by pixel, every window summed anew.
 fn brute_force(left: &Image8, right: &Image8, rules: &DenseRules, u: i64, v: i64) -> Option<f64> {
     let slope = |image: &Image8, u: i64, v: i64| {
@@ -158,7 +200,7 @@ fn brute_force(left: &Image8, right: &Image8, rules: &DenseRules, u: i64, v: i64
         .map(|d| sum(u, d))
         .min()
         .unwrap();
-    let unique = second * 100 >= least * (100 + rules.uniqueness_percent as i32);
+    let unique = second > least && second * 100 >= least * (100 + rules.uniqueness_percent as i32);
     let back = (0..most)
         .filter(|d| u - best + d < i64::from(left.width_px) - half)
         .min_by_key(|&d| (sum(u - best + d, d), d))

@@ -5,7 +5,11 @@
 //! "Splines: a perfect fit", 1999), whose phase error is the smallest and which subpixel matching
 //! uses.
 
+mod grid;
+
 use crate::image::ImageF;
+
+pub(crate) use grid::{CHUNK, Grid};
 
 /// A value and its derivatives to the right and downwards, per px.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -50,16 +54,6 @@ pub fn bilinear(image: &ImageF, u: f64, v: f64) -> Option<Sample> {
     })
 }
 
-/// The largest whole number not above `x`, or one more if `x` is within 1e-4 below it (the spline's
-/// polynomials join smoothly there), for |x| below 1024.
-#[inline(always)]
-fn near_floor(x: f32) -> i32 {
-    (x + 1024.0) as i32 - 1024
-}
-
-/// Samples of a grid whose weights are worked out together.
-const CHUNK: usize = 16;
-
 /// Weights of Keys' kernel (a = -1/2) for the pixels at -1, 0, 1, 2 and their derivatives.
 fn keys_weights(t: f32) -> ([f32; 4], [f32; 4]) {
     let (t2, t3) = (t * t, t * t * t);
@@ -90,65 +84,6 @@ fn spline_weights(t: f32) -> [f32; 4] {
         2.0 / 3.0 - 0.5 * s2 * (2.0 - s),
         t2 * t * (1.0 / 6.0),
     ]
-}
-
-/// One row of a grid of samples: the first place and the step, px from `base`.
-struct Line {
-    at: [f32; 2],
-    step: [f32; 2],
-    base: [i32; 2],
-}
-
-/// Samples `i..i + 4` of a chunk from 4 x 4 coefficients each.
-///
-/// # Safety
-/// From each of `starts[i..i + 4]` four rows of four values must follow, the rows `width` apart;
-/// `i + 4` is at most [`CHUNK`].
-#[inline(always)]
-unsafe fn weigh(
-    values: &[f32],
-    width: usize,
-    starts: &[i32; CHUNK],
-    i: usize,
-    wus: &[[f32; CHUNK]; 4],
-    wvs: &[[f32; CHUNK]; 4],
-    samples: &mut [f32; CHUNK],
-) {
-    #[cfg(target_arch = "x86_64")]
-    {
-        use std::arch::x86_64::{
-            _MM_TRANSPOSE4_PS, _mm_add_ps, _mm_loadu_ps, _mm_mul_ps, _mm_set1_ps, _mm_storeu_ps,
-        };
-        // SAFETY: SSE belongs to every x86-64; the caller guarantees that the reads are inside.
-        unsafe {
-            let column = |s: usize| {
-                let first = values.as_ptr().add(starts[i + s] as usize);
-                let row = |k: usize| {
-                    let weight = _mm_set1_ps(*wvs[k].get_unchecked(i + s));
-                    _mm_mul_ps(weight, _mm_loadu_ps(first.add(k * width)))
-                };
-                _mm_add_ps(_mm_add_ps(_mm_add_ps(row(0), row(1)), row(2)), row(3))
-            };
-            let (mut a, mut b, mut c, mut d) = (column(0), column(1), column(2), column(3));
-            _MM_TRANSPOSE4_PS(&mut a, &mut b, &mut c, &mut d);
-            let part = |k: usize, x| _mm_mul_ps(x, _mm_loadu_ps(wus[k].as_ptr().add(i)));
-            let sum = _mm_add_ps(
-                _mm_add_ps(part(0, a), part(1, b)),
-                _mm_add_ps(part(2, c), part(3, d)),
-            );
-            _mm_storeu_ps(samples.as_mut_ptr().add(i), sum);
-        }
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    for k in i..i + 4 {
-        let start = starts[k] as usize;
-        let column = |x: usize| {
-            let row = |j: usize| wvs[j][k] * values[start + j * width + x];
-            ((row(0) + row(1)) + row(2)) + row(3)
-        };
-        samples[k] = (column(0) * wus[0][k] + column(1) * wus[1][k])
-            + (column(2) * wus[2][k] + column(3) * wus[3][k]);
-    }
 }
 
 /// Derivatives of [`spline_weights`].
@@ -253,97 +188,6 @@ impl SplineImage {
         u >= 1.0 && v >= 1.0 && u <= self.width() as f64 - 2.0 && v <= self.height() as f64 - 2.0
     }
 
-    /// Values on the affine grid `origin + i * step_u + j * step_v`, i < `columns`, j < `rows`,
-    /// written to `out` row by row. The caller guarantees with [`SplineImage::covers`] that the
-    /// four corners are inside; returns `false` and leaves `out` undefined if one is not.
-    pub(crate) fn sample_grid(
-        &self,
-        origin: [f64; 2],
-        step_u: [f64; 2],
-        step_v: [f64; 2],
-        columns: usize,
-        rows: usize,
-        out: &mut [f32],
-    ) -> bool {
-        let (last_u, last_v) = (columns as f64 - 1.0, rows as f64 - 1.0);
-        for (i, j) in [(0.0, 0.0), (last_u, 0.0), (0.0, last_v), (last_u, last_v)] {
-            if !self.covers(
-                origin[0] + i * step_u[0] + j * step_v[0],
-                origin[1] + i * step_u[1] + j * step_v[1],
-            ) {
-                return false;
-            }
-        }
-        if self.width() < 4 || self.height() < 4 {
-            return false;
-        }
-        // relative to the first sample's pixel, so that single precision holds 1e-5 px
-        let base = [origin[0].floor(), origin[1].floor()];
-        let lines = out.chunks_exact_mut(columns).take(rows).enumerate();
-        for (j, line) in lines {
-            let at = [0, 1].map(|k| (origin[k] - base[k] + j as f64 * step_v[k]) as f32);
-            let grid = Line {
-                at,
-                step: step_u.map(|x| x as f32),
-                base: base.map(|x| x as i32),
-            };
-            self.sample_line(&grid, line);
-        }
-        true
-    }
-
-    /// One row of a grid. The image has 4 x 4 px at least.
-    fn sample_line(&self, grid: &Line, out: &mut [f32]) {
-        #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") {
-            // SAFETY: the processor has AVX2.
-            return unsafe { self.sample_line_avx2(grid, out) };
-        }
-        self.sample_line_plain(grid, out);
-    }
-
-    /// The same with wider vectors.
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2")]
-    fn sample_line_avx2(&self, grid: &Line, out: &mut [f32]) {
-        self.sample_line_plain(grid, out);
-    }
-
-    #[inline(always)]
-    fn sample_line_plain(&self, grid: &Line, out: &mut [f32]) {
-        let (width, height) = (self.width(), self.height());
-        let values = self.coefficients.values();
-        assert!(width >= 4 && height >= 4 && values.len() == width * height);
-        let (max_u, max_v) = (width as i32 - 3, height as i32 - 3);
-        for (c, chunk) in out.chunks_mut(CHUNK).enumerate() {
-            // first coefficients and weights of a whole chunk, then its samples, four at a time:
-            // all in arrays of fixed length, which the compiler turns into vectors
-            let mut starts = [0i32; CHUNK];
-            let (mut wus, mut wvs) = ([[0.0f32; CHUNK]; 4], [[0.0f32; CHUNK]; 4]);
-            for i in 0..CHUNK {
-                let k = (c * CHUNK + i) as f32;
-                let (u, v) = (grid.at[0] + k * grid.step[0], grid.at[1] + k * grid.step[1]);
-                let iu = (near_floor(u) + grid.base[0]).clamp(1, max_u);
-                let iv = (near_floor(v) + grid.base[1]).clamp(1, max_v);
-                let wu = spline_weights(u - (iu - grid.base[0]) as f32);
-                let wv = spline_weights(v - (iv - grid.base[1]) as f32);
-                starts[i] = (iv - 1) * width as i32 + iu - 1;
-                for k in 0..4 {
-                    wus[k][i] = wu[k];
-                    wvs[k][i] = wv[k];
-                }
-            }
-            let mut samples = [0.0f32; CHUNK];
-            for i in (0..CHUNK).step_by(4) {
-                // SAFETY: row and column of every start are held between 0 and size - 4 above, so
-                // that four rows of four coefficients follow, and i + 4 is at most CHUNK.
-                unsafe { weigh(values, width, &starts, i, &wus, &wvs, &mut samples) };
-            }
-            let n = chunk.len();
-            chunk.copy_from_slice(&samples[..n]);
-        }
-    }
-
     /// Gradients exactly at the pixels (`iu`..) of row `iv`, all at least one pixel inside.
     pub(crate) fn gradient_row(&self, iu: usize, iv: usize, du: &mut [f32], dv: &mut [f32]) {
         let (width, n) = (self.width(), du.len());
@@ -369,7 +213,7 @@ mod tests {
         120.0 + 40.0 * (0.9 * u + 0.3 * v).sin() + 25.0 * (0.7 * v - 0.2 * u).cos()
     }
 
-    fn wave_image() -> ImageF {
+    pub(super) fn wave_image() -> ImageF {
         let values = (0..40 * 30).map(|i| wave((i % 40) as f64, (i / 40) as f64) as f32);
         ImageF::from_raw(40, 30, values.collect()).unwrap()
     }
@@ -442,27 +286,5 @@ mod tests {
         }
         assert!(spline.sample(0.5, 5.0).is_none());
         assert!(spline.sample(38.0, 28.0).is_some() && spline.covers(38.0, 28.0));
-    }
-
-    #[test]
-    fn a_grid_equals_its_single_samples() {
-        let image = wave_image();
-        let spline = SplineImage::new(&image);
-        let mut out = vec![0.0; 7 * 5];
-        let (origin, a, b) = ([6.3, 7.1], [1.1, 0.05], [-0.1, 0.95]);
-        assert!(spline.sample_grid(origin, a, b, 7, 5, &mut out));
-        for j in 0..5 {
-            for i in 0..7 {
-                let (fi, fj) = (i as f64, j as f64);
-                let s = spline
-                    .sample(
-                        origin[0] + fi * a[0] + fj * b[0],
-                        origin[1] + fi * a[1] + fj * b[1],
-                    )
-                    .unwrap();
-                assert!((s.value - out[j * 7 + i]).abs() < 1e-3);
-            }
-        }
-        assert!(!spline.sample_grid([35.0, 7.0], a, b, 7, 5, &mut out));
     }
 }
