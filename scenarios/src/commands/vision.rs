@@ -1,9 +1,10 @@
 //! `rover vision`: fiducials and stereo on a person's own images.
 
 mod disparity;
+mod doubt;
 mod evaluate;
 mod find;
-mod input;
+pub(super) mod input;
 mod stereo;
 
 use super::{CommandError, Exit};

@@ -1,6 +1,6 @@
 //! `rover camera convert`: between the formats of model files.
 
-use super::files::{self, Format, express, load};
+use super::files::{self, About, Format, express, load};
 use crate::{commands::CommandError, output::Output};
 use rover_cameras::formats::ConversionRules;
 use serde_json::json;
@@ -26,10 +26,9 @@ pub(super) struct ConvertArgs {
     /// Nearest range at which the two shall agree; matters for a lens with a moving pupil
     #[arg(long, value_name = "M", default_value_t = 0.5)]
     near_m: f64,
-    /// Image size, if the input does not give it
-    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size)]
-    size: Option<[u32; 2]>,
-    /// Names the frame of the vectors
+    #[command(flatten)]
+    about: About,
+    /// Names the frame of the vectors (cahv, toml; the camera in ros)
     #[arg(long, value_name = "NAME")]
     frame: Option<String>,
     /// Cuts out a part of the image: column, row, width, height
@@ -46,19 +45,10 @@ pub(super) struct ConvertArgs {
     force: bool,
 }
 
-fn numbers<const N: usize>(text: &str, by: char) -> Option<[u32; N]> {
-    let all: Option<Vec<u32>> = text.split(by).map(|x| x.trim().parse().ok()).collect();
-    all?.try_into().ok()
-}
-
-fn size(text: &str) -> Result<[u32; 2], String> {
-    numbers(text, 'x')
-        .filter(|s| !s.contains(&0))
-        .ok_or_else(|| "expected WIDTHxHEIGHT in whole pixels, e.g. 640x480".into())
-}
-
 fn four(text: &str) -> Result<[u32; 4], String> {
-    numbers(text, ',').ok_or_else(|| "expected U,V,W,H in whole pixels".into())
+    let all: Option<Vec<u32>> = text.split(',').map(|x| x.trim().parse().ok()).collect();
+    all.and_then(|all| all.try_into().ok())
+        .ok_or_else(|| "expected U,V,W,H in whole pixels".into())
 }
 
 /// Runs the verb.
@@ -78,6 +68,11 @@ pub(super) fn run(args: &ConvertArgs) -> Result<(), CommandError> {
                 args.output.display()
             ))
         })?;
+    if args.frame.is_some() && matches!(format, Format::Opencv | Format::Kalibr) {
+        return Err(CommandError::BadInput(
+            "--frame has no effect on opencv and kalibr files: they name no frame".into(),
+        ));
+    }
     let output = Output::open(&args.output, args.force)?;
     let report = args
         .json
@@ -88,17 +83,8 @@ pub(super) fn run(args: &ConvertArgs) -> Result<(), CommandError> {
         limit_px: args.limit_px,
         near_m: args.near_m,
     };
-    let mut loaded = load(&args.input, &rules, args.size)?;
+    let mut loaded = load(&args.input, &rules, &args.about)?;
     loaded.report_notes();
-    if let Some(size) = args.size {
-        if let Some(given) = loaded.file.size_px.filter(|given| *given != size) {
-            return Err(CommandError::BadInput(format!(
-                "--size {}x{}: {} says {} x {} px",
-                size[0], size[1], loaded.name, given[0], given[1]
-            )));
-        }
-        loaded.file.size_px = Some(size);
-    }
     if args.subframe.is_some() || args.downsample.is_some() {
         let mut camera = loaded.camera()?;
         let wrong = |e: rover_cameras::CameraError| CommandError::BadInput(e.to_string());
