@@ -44,10 +44,7 @@ fn plain(message: &str) -> String {
     if message.starts_with("budget breached: Documents")
         && let Some(line) = line_of(message)
     {
-        return format!(
-            "a second document begins at line {line}, expected one camera, or the cameras of one \
-             chain, without more"
-        );
+        return format!("a second document begins at line {line}, expected one");
     }
     message
         .replace(", set DuplicateKeyPolicy in Options if acceptable", "")

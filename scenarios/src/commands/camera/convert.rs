@@ -2,7 +2,6 @@
 
 use super::files::{self, About, Format, express, load};
 use crate::{commands::CommandError, output::Output};
-use rover_cameras::formats::ConversionRules;
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -20,9 +19,6 @@ pub(super) struct ConvertArgs {
     /// for YAML)
     #[arg(long, value_name = "FORMAT")]
     to: Option<Format>,
-    /// Largest pixel error that is accepted
-    #[arg(long, value_name = "PX", default_value_t = 0.1)]
-    limit_px: f64,
     /// Nearest range at which the two shall agree; matters for a lens with a moving pupil
     #[arg(long, value_name = "M", default_value_t = 0.5)]
     near_m: f64,
@@ -53,12 +49,7 @@ fn four(text: &str) -> Result<[u32; 4], String> {
 
 /// Runs the verb.
 pub(super) fn run(args: &ConvertArgs) -> Result<(), CommandError> {
-    if !(args.limit_px >= 0.0 && args.near_m > 0.0 && args.near_m.is_finite()) {
-        return Err(CommandError::BadInput(format!(
-            "--limit-px {} --near-m {}: expected numbers above 0",
-            args.limit_px, args.near_m
-        )));
-    }
+    let rules = args.about.rules(args.near_m)?;
     let format = args
         .to
         .or_else(|| files::by_extension(&args.output))
@@ -79,10 +70,6 @@ pub(super) fn run(args: &ConvertArgs) -> Result<(), CommandError> {
         .as_deref()
         .map(|path| Output::open(path, args.force))
         .transpose()?;
-    let rules = ConversionRules {
-        limit_px: args.limit_px,
-        near_m: args.near_m,
-    };
     let mut loaded = load(&args.input, &rules, &args.about)?;
     loaded.report_notes();
     if args.subframe.is_some() || args.downsample.is_some() {

@@ -44,8 +44,11 @@ pub(super) struct Fidelity {
 }
 
 /// What a person says about a model file beside its name.
-#[derive(Clone, Debug, Default, clap::Args)]
+#[derive(Clone, Debug, clap::Args)]
 pub(super) struct About {
+    /// Largest pixel error that is accepted of a lens that must be fitted
+    #[arg(long, value_name = "PX", default_value_t = ConversionRules::default().limit_px)]
+    pub(super) limit_px: f64,
     /// Image size, if the file does not give it (OpenCV stereo files do not)
     #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size)]
     size: Option<[u32; 2]>,
@@ -55,6 +58,30 @@ pub(super) struct About {
     /// Unit of T of an OpenCV stereo file MODEL#2, as the squares of the board were given [default: 1]
     #[arg(long, value_name = "M")]
     unit_m: Option<f64>,
+}
+
+impl Default for About {
+    fn default() -> Self {
+        Self {
+            limit_px: ConversionRules::default().limit_px,
+            size: None,
+            extrinsics: None,
+            unit_m: None,
+        }
+    }
+}
+
+impl About {
+    /// The rules of conversion: the two models shall agree from `near_m` on, m.
+    pub(super) fn rules(&self, near_m: f64) -> Result<ConversionRules, CommandError> {
+        let limit_px = self.limit_px;
+        if limit_px >= 0.0 && near_m > 0.0 && near_m.is_finite() {
+            return Ok(ConversionRules { limit_px, near_m });
+        }
+        Err(CommandError::BadInput(format!(
+            "--limit-px {limit_px} --near-m {near_m}: expected numbers above 0"
+        )))
+    }
 }
 
 fn size(text: &str) -> Result<[u32; 2], String> {

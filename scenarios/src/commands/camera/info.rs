@@ -32,7 +32,8 @@ pub(super) fn run(args: &InfoArgs) -> Result<(), CommandError> {
         .as_deref()
         .map(|path| Output::open(path, args.force))
         .transpose()?;
-    let loaded = load(&args.model, &ConversionRules::default(), &args.about)?;
+    let rules = args.about.rules(ConversionRules::default().near_m)?;
+    let loaded = load(&args.model, &rules, &args.about)?;
     loaded.report_notes();
     let size = loaded.file.size_px;
     // Without a size the terms are the same; only the field of view is not known.

@@ -24,7 +24,7 @@ const FEW_MATCHES: f64 = 0.2;
 const FEWEST_PIXELS: usize = 10;
 /// What the exchanged pair must answer, as a share; and what share of the pixels must have failed on
 /// what the other picture shows, if the exchanged one does no better.
-const GOOD_MATCHES: f64 = 0.5;
+const GOOD_MATCHES: f64 = 0.25;
 const UNLIKE: f64 = 0.6;
 /// How many times more the exchanged pair must answer.
 const TIMES: f64 = 4.0;
