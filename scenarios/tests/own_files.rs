@@ -52,6 +52,14 @@ fn an_option_without_effect_is_refused_by_name() {
         let find = [&["vision", "find", "i.png", "--fiducial", kind][..], more].concat();
         refused(at, &find, &[more[0], word]);
     }
+    let twice = std::process::Command::new(env!("CARGO_BIN_EXE_rover"))
+        .args(["vision", "find", "-", "--fiducial", "disc", "--rules", "-"])
+        .stdin(std::fs::File::open(at.join("i.png")).unwrap())
+        .output()
+        .unwrap();
+    let said = support::text(&twice.stderr);
+    assert_eq!(twice.status.code(), Some(2), "{said}");
+    assert!(said.contains("given twice"), "{said}");
     for (args, option) in [
         (
             &["fk", "arm.urdf", "j.csv", "--tool-axis", "1,0,0"][..],

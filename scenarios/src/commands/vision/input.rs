@@ -2,6 +2,7 @@
 
 use std::io::Read;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use rover_cameras::{Camera, StereoPair};
@@ -21,6 +22,11 @@ fn bytes(path: &Path) -> Result<Vec<u8>, CommandError> {
         CommandError::BadInput(format!("{}: {e}", path.display()))
     };
     if path == Path::new("-") {
+        static IS_READ: AtomicBool = AtomicBool::new(false);
+        if IS_READ.swap(true, Ordering::Relaxed) {
+            let why = "- is given twice: expected standard input for one file only";
+            return Err(CommandError::BadInput(why.into()));
+        }
         let mut all = Vec::new();
         std::io::stdin().read_to_end(&mut all).map_err(refuse)?;
         return Ok(all);
