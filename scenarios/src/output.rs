@@ -1,5 +1,6 @@
 //! Output files: `-` is standard output, and what exists is overwritten only with `--force`.
 
+use rover_files::FileError;
 use std::{
     io::{self, Write},
     path::{Path, PathBuf},
@@ -20,7 +21,7 @@ pub enum OutputError {
         /// The file.
         path: String,
         /// What the system said.
-        source: io::Error,
+        source: FileError,
     },
 }
 
@@ -68,7 +69,7 @@ impl Output {
             Self::File(path) => {
                 let file = |source| OutputError::File {
                     path: path.display().to_string(),
-                    source,
+                    source: FileError::writing(source),
                 };
                 if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
                     std::fs::create_dir_all(folder).map_err(file)?;
@@ -93,7 +94,7 @@ fn print_bytes(bytes: &[u8]) -> Result<(), OutputError> {
         Err(e) if e.kind() == io::ErrorKind::BrokenPipe => Ok(()),
         other => other.map_err(|source| OutputError::File {
             path: "standard output".into(),
-            source,
+            source: FileError::writing(source),
         }),
     }
 }

@@ -10,6 +10,7 @@ mod target;
 mod variation;
 
 use crate::embedded;
+use rover_files::FileError;
 use rover_messages::{
     placement::{ContactGoal, Method, Observation, PlaceGoal, PlaceResult},
     target::Target,
@@ -189,7 +190,7 @@ pub enum ScenarioError {
         /// The file.
         path: String,
         /// What the system said.
-        source: std::io::Error,
+        source: FileError,
     },
     /// Not a scenario; the message has line, column, field, found and expected.
     #[error("{origin}: {message}")]
@@ -349,7 +350,7 @@ fn read(
             }),
         Err(source) => Err(ScenarioError::File {
             path: path.display().to_string(),
-            source,
+            source: source.into(),
         }),
     }
 }

@@ -2,7 +2,8 @@
 //!
 //! A [`Table`] is read row by row, so its length is bounded by nothing and its memory by one line. The
 //! header must name the expected columns in their order. Every cell is a finite decimal number. A
-//! byte-order mark, CRLF line ends, blank lines and quoted cells are understood.
+//! byte-order mark, CRLF line ends, blank lines, lines that begin with `#` and quoted cells are
+//! understood; such a comment may be the header of a table that begins with numbers.
 //!
 //! A [`TableWriter`] writes the answers in the order of the rows, with a last column `status`: `ok`, or
 //! the reason why this row has no answer, whose cells are then empty. A table that was written this way
@@ -26,6 +27,7 @@
 //! # }
 //! ```
 
+mod lines;
 mod names;
 mod reader;
 mod writer;
@@ -36,6 +38,7 @@ pub use reader::{Row, Table};
 pub use writer::TableWriter;
 
 use crate::output::OutputError;
+use rover_files::FileError;
 
 /// The last column of every table that is written.
 pub const STATUS: &str = "status";
@@ -52,7 +55,7 @@ pub enum TableError {
         /// The file, or "standard input".
         file: String,
         /// What the system said.
-        source: std::io::Error,
+        source: FileError,
     },
     /// The file cannot be read on.
     #[error("{file}:{line}: {what}")]

@@ -1,70 +1,17 @@
-//! `rover vision` on images that the test writes: answers, tables, refusals and exit codes.
+//! `rover vision` on images that the test writes: answers, refusals and exit codes.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)]
 
-use std::{
-    path::Path,
-    process::{Command, Output},
-};
+mod support;
 
-use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector2, Vector3};
-use rover_cameras::{Camera, formats::write_text};
+use std::{path::Path, process::Output};
+
+use nalgebra::Vector3;
 use rover_vision::{Image8, PlateLayout, texture::texture};
+use support::{camera, json, model, photograph, text, write};
 
 fn rover(folder: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_rover"))
-        .args(["vision"])
-        .args(args)
-        .current_dir(folder)
-        .env_remove("RUST_LOG")
-        .output()
-        .unwrap()
-}
-
-fn text(bytes: &[u8]) -> String {
-    String::from_utf8_lossy(bytes).into_owned()
-}
-
-fn json(out: &Output) -> serde_json::Value {
-    serde_json::from_slice(&out.stdout).unwrap_or_else(|e| panic!("{e}: {}", text(&out.stderr)))
-}
-
-/// A camera at (`x`, 0, 0), looking along z.
-fn camera(x: f64) -> Camera {
-    let pose = Isometry3::from_parts(Translation3::new(x, 0.0, 0.0), UnitQuaternion::identity());
-    Camera::pinhole(&pose, [400.0; 2], [159.5, 119.5], [320, 240])
-}
-
-/// The plane through (0, 0, 0.6) with this normal, as `shade` of x and y colours it.
-fn photograph(camera: &Camera, normal: Vector3<f64>, shade: &dyn Fn(f64, f64) -> f64) -> Image8 {
-    let mut pixels = Vec::new();
-    for v in 0..240 {
-        for u in 0..320 {
-            let mut sum = 0.0;
-            for k in 0..9 {
-                let part = |k: i32| (f64::from(k) - 1.0) / 3.0;
-                let at = Vector2::new(f64::from(u) + part(k % 3), f64::from(v) + part(k / 3));
-                let ray = camera.ray(&at).unwrap();
-                let offset = Vector3::new(0.0, 0.0, 0.6) - ray.origin;
-                let p = ray.at(normal.dot(&offset) / normal.dot(ray.direction.as_ref()));
-                sum += shade(p.x, p.y);
-            }
-            pixels.push((sum / 9.0).round().clamp(0.0, 255.0) as u8);
-        }
-    }
-    Image8::from_raw(320, 240, pixels).unwrap()
-}
-
-fn write(folder: &Path, name: &str, image: &Image8) {
-    image.write_png(&folder.join(name)).unwrap();
-}
-
-fn model(folder: &Path, name: &str, camera: &Camera) {
-    std::fs::write(
-        folder.join(name),
-        write_text(camera, Some("rover")).unwrap(),
-    )
-    .unwrap();
+    support::run(folder, &[&["vision"], args].concat())
 }
 
 #[test]
@@ -188,168 +135,6 @@ fn what_is_not_there_ends_with_3_and_says_which_rule_refused() {
         assert_eq!(said["refused_by"], "nothing_there", "{said}");
         assert!(said.get("u_px").is_none() && said["status"] != "ok");
         assert!(text(&out.stderr).contains(kind));
-    }
-}
-
-#[test]
-fn pixels_are_matched_triangulated_and_their_surface_measured() {
-    let folder = tempfile::tempdir().unwrap();
-    let at = folder.path();
-    let normal = Vector3::new(0.2, 0.5, -1.0).normalize();
-    let rock = |x: f64, y: f64| texture(x, y, 0.06, 0.003, 25.0, 8);
-    for (side, x) in [("left", 0.0), ("right", 0.06)] {
-        write(
-            at,
-            &format!("{side}.png"),
-            &photograph(&camera(x), normal, &rock),
-        );
-        model(at, &format!("{side}.cahv"), &camera(x));
-    }
-    std::fs::write(at.join("p.csv"), "u_px,v_px\n180,130\n2,2\n150.5,110.25\n").unwrap();
-    let models = ["--left-model", "left.cahv", "--right-model", "right.cahv"];
-    let pair = [&["left.png", "right.png"][..], &models[..]].concat();
-    let out = rover(
-        at,
-        &[&["match"], &pair[..], &["--pixels", "p.csv"]].concat(),
-    );
-    let table = text(&out.stdout);
-    assert_eq!(out.status.code(), Some(0), "{}", text(&out.stderr));
-    let lines: Vec<&str> = table.lines().collect();
-    assert_eq!(lines[0], "ur_px,vr_px,x_m,y_m,z_m,score,status");
-    assert_eq!(lines.len(), 4);
-    for (line, pixel) in [(lines[1], [180.0, 130.0]), (lines[3], [150.5, 110.25])] {
-        let cells: Vec<&str> = line.split(',').collect();
-        assert_eq!(cells[6], "ok", "{line}");
-        let ray = camera(0.0).ray(&Vector2::from(pixel)).unwrap();
-        let plane = Vector3::new(0.0, 0.0, 0.6);
-        let truth = ray.at(normal.dot(&plane) / normal.dot(ray.direction.as_ref()));
-        for (k, cell) in cells[2..5].iter().enumerate() {
-            let found: f64 = cell.parse().unwrap();
-            assert!((found - truth[k]).abs() < 3e-3, "{line}: {truth}");
-        }
-    }
-    assert!(lines[2].starts_with(",,,,,,") && lines[2].contains("leaves the image"));
-
-    let out = rover(
-        at,
-        &[&["normal"], &pair[..], &["--pixel", "170,125"]].concat(),
-    );
-    let seen = json(&out);
-    assert_eq!(out.status.code(), Some(0), "{seen}");
-    let found = Vector3::new(0, 1, 2).map(|k: usize| seen["normal"][k].as_f64().unwrap());
-    assert!(found.dot(&normal) > 0.998, "{seen}");
-    assert!(seen["points_used"].as_u64().unwrap() > 40);
-    assert!(seen["plane_rms_mm"].as_f64().unwrap() < 1.5);
-    let out = rover(at, &[&["normal"], &pair[..], &["--pixel", "1,1"]].concat());
-    assert_eq!(out.status.code(), Some(3), "{}", text(&out.stdout));
-}
-
-#[test]
-fn the_disparity_image_has_the_planes_depth_and_marks_what_it_does_not_know() {
-    let folder = tempfile::tempdir().unwrap();
-    let at = folder.path();
-    let normal = Vector3::new(0.1, 0.4, -1.0).normalize();
-    let rock = |x: f64, y: f64| texture(x, y, 0.06, 0.003, 25.0, 9);
-    for (side, x) in [("left", 0.0), ("right", 0.06)] {
-        let image = photograph(&camera(x), normal, &rock);
-        write(at, &format!("{side}.png"), &image);
-        model(at, &format!("{side}.cahv"), &camera(x));
-    }
-    let flat = Image8::from_raw(320, 240, vec![90; 320 * 240]).unwrap();
-    write(at, "flat.png", &flat);
-    let models = ["--left-model", "left.cahv", "--right-model", "right.cahv"];
-    let ask = |images: [&str; 2], more: &[&str]| {
-        rover(
-            at,
-            &[&["disparity"], &images[..], &models[..], more].concat(),
-        )
-    };
-    let ranges = ["--range-min-m", "0.35", "--range-max-m", "1.2"];
-    let out = ask(
-        ["left.png", "right.png"],
-        &[&ranges[..], &["-o", "d.csv", "--json", "-"]].concat(),
-    );
-    assert_eq!(out.status.code(), Some(0), "{}", text(&out.stderr));
-    let summary = json(&out);
-    assert!((summary["disparity_depth_px_m"].as_f64().unwrap() - 24.0).abs() < 1e-6);
-    assert!(
-        summary["found_percent"].as_f64().unwrap() > 50.0,
-        "{summary}"
-    );
-
-    let table = std::fs::read_to_string(at.join("d.csv")).unwrap();
-    let mut lines = table.lines();
-    assert_eq!(
-        lines.next(),
-        Some("u_px,v_px,disparity_px,x_m,y_m,z_m,status")
-    );
-    let (mut found, mut all, mut off) = (0u64, 0, Vec::new());
-    let mut disparities = Vec::new();
-    for line in lines {
-        let cells: Vec<&str> = line.split(',').collect();
-        let pixel = [all % 320, all / 320].map(|x| x.to_string());
-        assert_eq!(cells[..2], pixel[..], "{line}");
-        all += 1;
-        if cells[6..] != ["ok"] {
-            assert_eq!(cells[2..6], [""; 4], "{line}");
-            assert!(cells[6].len() > 10, "{line}");
-            disparities.push(None);
-            continue;
-        }
-        found += 1;
-        let number = |k: usize| cells[k].parse::<f64>().unwrap();
-        // the cameras are parallel: rectified and taken pixels are alike
-        let ray = camera(0.0)
-            .ray(&Vector2::new(number(0), number(1)))
-            .unwrap();
-        let plane = Vector3::new(0.0, 0.0, 0.6);
-        let depth = ray
-            .at(normal.dot(&plane) / normal.dot(ray.direction.as_ref()))
-            .z;
-        off.push((number(2) - 24.0 / depth).abs());
-        assert!((number(5) - 24.0 / number(2)).abs() < 1e-9, "{line}");
-        disparities.push(Some(number(2)));
-    }
-    assert_eq!((all, summary["found"].as_u64()), (320 * 240, Some(found)));
-    off.sort_by(f64::total_cmp);
-    let (median, most) = (off[off.len() / 2], off[off.len() * 99 / 100]);
-    assert!(median < 0.1 && most < 0.5, "{median} {most}");
-
-    // the same as a picture: 64 steps per px, 0 for no answer
-    let png = [&ranges[..], &["--out", "d.png"]].concat();
-    let out = ask(["left.png", "right.png"], &png);
-    assert_eq!(out.status.code(), Some(0), "{}", text(&out.stderr));
-    let picture = image::open(at.join("d.png")).unwrap();
-    let image::DynamicImage::ImageLuma16(picture) = picture else {
-        panic!("not a 16-bit grey image");
-    };
-    for (pixel, disparity) in picture.pixels().zip(&disparities) {
-        let steps = disparity.map_or(0, |d| (d * 64.0) as u16);
-        assert_eq!(pixel.0[0], steps);
-    }
-
-    let out = ask(
-        ["flat.png", "flat.png"],
-        &["-o", "-", "--json", "flat.json"],
-    );
-    assert_eq!(out.status.code(), Some(3), "{}", text(&out.stderr));
-    assert!(
-        text(&out.stdout)
-            .lines()
-            .nth(1)
-            .unwrap()
-            .starts_with("0,0,,,,,no match")
-    );
-    let refusals: [(&[&str], &str); 4] = [
-        (&["-o", "d.tiff"], ".png"),
-        (&["-o", "d.png"], "--force"),
-        (&["-o", "-", "--json", "-"], "standard output"),
-        (&["-o", "e.png", "--range-min-m", "0.01"], "256"),
-    ];
-    for (more, why) in refusals {
-        let out = ask(["left.png", "right.png"], more);
-        assert_eq!(out.status.code(), Some(2), "{more:?}");
-        assert!(text(&out.stderr).contains(why), "{}", text(&out.stderr));
     }
 }
 

@@ -6,6 +6,7 @@
 //! connects to all that were started before it; clients reach everybody through any one peer.
 
 use crate::BusError;
+use rover_files::FileError;
 use std::{path::PathBuf, time::Duration};
 use zenoh::key_expr::keyexpr;
 
@@ -78,10 +79,15 @@ impl NetworkConfig {
             check_namespace(&self.namespace)?;
         }
         let mut config = match &self.file {
-            Some(path) => zenoh::Config::from_file(path).map_err(|e| BusError::Config {
-                setting: path.display().to_string(),
-                reason: e.to_string(),
-            })?,
+            Some(path) => {
+                let refused = |reason: String| BusError::Config {
+                    setting: path.display().to_string(),
+                    reason,
+                };
+                // Zenoh would say where in its own source the file was missed.
+                std::fs::read(path).map_err(|e| refused(FileError::from(e).to_string()))?;
+                zenoh::Config::from_file(path).map_err(|e| refused(e.to_string()))?
+            }
             None => self.defaults()?,
         };
         let mut on_top = Vec::new();

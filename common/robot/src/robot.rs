@@ -2,6 +2,7 @@
 
 use crate::{CameraPairDescription, PoseDescription, RobotDescription, check::Check};
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+use rover_files::FileError;
 use rover_geometry::{ArmBase, Link, Rover, Transform};
 use rover_kinematics::{Arm, DhRow, JointLimits, Tool};
 use sha2::{Digest, Sha256};
@@ -21,7 +22,7 @@ pub enum RobotError {
         /// The file.
         path: String,
         /// What the system said.
-        source: std::io::Error,
+        source: FileError,
     },
     /// The text is not a robot description; the message has line and column.
     #[error("{origin}: {message}")]
@@ -85,7 +86,7 @@ impl Robot {
         let origin = path.display().to_string();
         let text = std::fs::read_to_string(path).map_err(|source| RobotError::File {
             path: origin.clone(),
-            source,
+            source: source.into(),
         })?;
         Self::parse(&text, &origin)
     }

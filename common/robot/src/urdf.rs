@@ -17,6 +17,7 @@ mod xml;
 pub use chain::{ChainOptions, UrdfArm};
 
 use nalgebra::{Isometry3, Unit, Vector3};
+use rover_files::FileError;
 use std::path::PathBuf;
 
 /// Why a URDF cannot be used. Lines count from 1.
@@ -28,7 +29,7 @@ pub enum UrdfError {
         /// The file.
         file: String,
         /// What the system said.
-        source: std::io::Error,
+        source: FileError,
     },
     /// The text is not what was expected.
     #[error("{file}:{line}:{column}: {message}")]

@@ -3,11 +3,11 @@
 //! Pixel (0, 0) is the centre of the first pixel, u to the right, v down; rows are stored one
 //! after the other from the top.
 
-use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{DynamicImage, ExtendedColorType, ImageEncoder, ImageFormat, ImageReader};
+use image::{ExtendedColorType, ImageEncoder};
+use rover_files::FileError;
 
 /// Largest width or height accepted from a file, px.
 pub const MAX_SIDE_PX: u32 = 16_384;
@@ -37,8 +37,8 @@ pub enum ImageError {
         /// Stated height, px.
         height_px: u32,
     },
-    /// The file is not a PNG or PGM image, or it is damaged.
-    #[error("not a readable grey PNG or PGM image: {0}")]
+    /// The data are no picture of a supported format, or damaged.
+    #[error("not a readable picture: {0}")]
     Decode(String),
     /// The PNG encoder refused.
     #[error("the image could not be written as PNG: {0}")]
@@ -49,7 +49,7 @@ pub enum ImageError {
         /// The file.
         path: PathBuf,
         /// What the operating system said.
-        source: std::io::Error,
+        source: FileError,
     },
     /// The file was read, its content is not usable.
     #[error("{path}: {source}")]
@@ -126,54 +126,22 @@ impl Image8 {
         }
     }
 
-    /// Decodes a PNG or PGM image of 8 or 16 bits; colour is converted to luma and 16 bits are
-    /// rounded to 8.
+    /// Decodes a picture as [`crate::picture::decode`] does.
     ///
     /// # Errors
-    /// [`ImageError::Decode`] for other formats and damaged data, [`ImageError::BadSize`] for
-    /// sides above [`MAX_SIDE_PX`].
+    /// As [`crate::picture::decode`].
     pub fn decode(bytes: &[u8]) -> Result<Self, ImageError> {
-        let decode = |e: &dyn std::fmt::Display| ImageError::Decode(e.to_string());
-        let mut reader = ImageReader::new(Cursor::new(bytes))
-            .with_guessed_format()
-            .map_err(|e| decode(&e))?;
-        if !matches!(reader.format(), Some(ImageFormat::Png | ImageFormat::Pnm)) {
-            return Err(ImageError::Decode(
-                "the data starts with neither a PNG nor a PNM mark".into(),
-            ));
-        }
-        let mut limits = image::Limits::default();
-        limits.max_image_width = Some(MAX_SIDE_PX);
-        limits.max_image_height = Some(MAX_SIDE_PX);
-        reader.limits(limits);
-        let picture = reader.decode().map_err(|e| decode(&e))?;
-        let (width_px, height_px) = (picture.width(), picture.height());
-        let pixels = match picture {
-            DynamicImage::ImageLuma8(grey) => grey.into_raw(),
-            DynamicImage::ImageLuma16(grey) => {
-                grey.into_raw().into_iter().map(eight_of_sixteen).collect()
-            }
-            DynamicImage::ImageLumaA16(_)
-            | DynamicImage::ImageRgb16(_)
-            | DynamicImage::ImageRgba16(_) => picture
-                .to_luma16()
-                .into_raw()
-                .into_iter()
-                .map(eight_of_sixteen)
-                .collect(),
-            other => other.to_luma8().into_raw(),
-        };
-        Self::from_raw(width_px, height_px, pixels)
+        crate::picture::decode(bytes).map(|decoded| decoded.image)
     }
 
-    /// Reads a PNG or PGM file, see [`Image8::decode`].
+    /// Reads a picture file, see [`Image8::decode`].
     ///
     /// # Errors
     /// [`ImageError::File`] or [`ImageError::Content`] naming the file.
     pub fn read(path: &Path) -> Result<Self, ImageError> {
         let bytes = std::fs::read(path).map_err(|source| ImageError::File {
             path: path.to_path_buf(),
-            source,
+            source: source.into(),
         })?;
         Self::decode(&bytes).map_err(|source| ImageError::Content {
             path: path.to_path_buf(),
@@ -188,13 +156,9 @@ impl Image8 {
     pub fn write_png(&self, path: &Path) -> Result<(), ImageError> {
         std::fs::write(path, encode_png(self)?).map_err(|source| ImageError::File {
             path: path.to_path_buf(),
-            source,
+            source: FileError::writing(source),
         })
     }
-}
-
-fn eight_of_sixteen(value: u16) -> u8 {
-    ((u32::from(value) * 255 + 32_767) / 65_535) as u8
 }
 
 /// The image as the bytes of a grey 8-bit PNG file (fast compression).
@@ -436,25 +400,6 @@ mod tests {
         let path = folder.path().join("ramp.png");
         image.write_png(&path).unwrap();
         assert_eq!(Image8::read(&path).unwrap(), image);
-    }
-
-    #[test]
-    fn sixteen_bit_pgm_is_rounded_to_eight() {
-        let mut pgm = b"P5\n2 1\n65535\n".to_vec();
-        pgm.extend([0xff, 0xff, 0x80, 0x80]);
-        assert_eq!(Image8::decode(&pgm).unwrap().pixels, vec![255, 128]);
-    }
-
-    #[test]
-    fn damaged_and_foreign_data_are_refused() {
-        assert!(matches!(
-            Image8::decode(b"GIF89a......"),
-            Err(ImageError::Decode(_))
-        ));
-        assert!(matches!(Image8::decode(&[]), Err(ImageError::Decode(_))));
-        let mut png = encode_png(&ramp()).unwrap();
-        png.truncate(40);
-        assert!(matches!(Image8::decode(&png), Err(ImageError::Decode(_))));
     }
 
     #[test]

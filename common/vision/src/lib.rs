@@ -10,6 +10,7 @@ pub mod find;
 pub mod harris;
 pub mod image;
 pub mod ncc;
+pub mod picture;
 pub mod plate;
 pub mod sample;
 pub mod stereo;

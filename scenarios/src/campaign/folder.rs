@@ -1,6 +1,7 @@
 //! A campaign on disk: what it is, and one record for each run that has ended.
 
 use crate::report::RunReport;
+use rover_files::FileError;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use std::{
     collections::BTreeMap,
@@ -20,7 +21,7 @@ pub enum CampaignError {
         /// The file or folder.
         path: String,
         /// What the system said.
-        source: io::Error,
+        source: FileError,
     },
     /// A file of the campaign is not what it should be.
     #[error("{path}: {message}")]
@@ -105,7 +106,7 @@ impl Folder {
     pub fn open(path: &Path, manifest: &Manifest) -> Result<Self, CampaignError> {
         let folder = Self { path: path.into() };
         let runs = path.join(RUNS);
-        std::fs::create_dir_all(&runs).map_err(file(&runs))?;
+        std::fs::create_dir_all(&runs).map_err(unwritten(&runs))?;
         let present = path.join(MANIFEST);
         match std::fs::read_to_string(&present) {
             Ok(text) => {
@@ -122,7 +123,7 @@ impl Folder {
                 folder.write(MANIFEST, &pretty(&present, manifest)?)?;
                 Ok(folder)
             }
-            Err(source) => Err(file(&present)(source)),
+            Err(source) => Err(unread(&present, source)),
         }
     }
 
@@ -144,7 +145,7 @@ impl Folder {
                 })
             }
             Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
-            Err(source) => Err(file(&path)(source)),
+            Err(source) => Err(unread(&path, source)),
         }
     }
 
@@ -171,7 +172,7 @@ impl Folder {
             new.persist(&path).map_err(|e| e.error)?;
             Ok(())
         };
-        write().map_err(file(&path))
+        write().map_err(unwritten(&path))
     }
 }
 
@@ -179,11 +180,18 @@ fn name(seed: u64) -> String {
     format!("{RUNS}/seed_{seed:06}.json")
 }
 
-fn file(path: &Path) -> impl Fn(io::Error) -> CampaignError {
+fn unread(path: &Path, source: io::Error) -> CampaignError {
+    CampaignError::File {
+        path: path.display().to_string(),
+        source: source.into(),
+    }
+}
+
+fn unwritten(path: &Path) -> impl Fn(io::Error) -> CampaignError {
     let path = path.display().to_string();
     move |source| CampaignError::File {
         path: path.clone(),
-        source,
+        source: FileError::writing(source),
     }
 }
 

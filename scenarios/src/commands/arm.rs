@@ -62,7 +62,9 @@ pub struct FkArgs {
 ///
 /// A target is the tool point and the approach axis in the arm's base frame; with --pose it is a whole
 /// pose, for arms of six or seven joints: x_m,y_m,z_m,qw,qx,qy,qz. Answers are within the joint limits.
-/// A target without an answer says which condition fails, and by how much.
+/// A target without an answer says which condition fails, and by how much. Where the arm has more joints
+/// than the target fixes (five by point and axis, six by a pose) there is a continuum of answers, of
+/// which --all gives samples.
 #[derive(Clone, Debug, clap::Args)]
 pub struct IkArgs {
     #[command(flatten)]
@@ -70,7 +72,7 @@ pub struct IkArgs {
     /// Table of targets; `-` is standard input
     #[arg(value_name = "TARGETS.csv")]
     pub targets: PathBuf,
-    /// All branches, one row each, with the number of the target in a first column `row`
+    /// All branches (samples of them where they are a continuum), one row each, with the number of the target in a first column `row`
     #[arg(long)]
     pub all: bool,
     /// Targets are whole poses
@@ -111,6 +113,7 @@ const POSE: [&str; 7] = ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"];
 const POINT_AXIS: [&str; 6] = ["x_m", "y_m", "z_m", "ax", "ay", "az"];
 
 fn fk(args: &FkArgs) -> Result<Exit, CommandError> {
+    args.model.check_used("arm fk", &[])?;
     let model = args.model.load()?;
     let table = Table::open(&args.joints, &joint_columns(model.arm.joint_count()))?;
     let mut out = TableWriter::create(&args.output.out, args.output.force, &POSE)?;
@@ -139,7 +142,30 @@ fn fk(args: &FkArgs) -> Result<Exit, CommandError> {
 }
 
 fn ik(args: &IkArgs) -> Result<Exit, CommandError> {
+    match (args.all, args.pose) {
+        (true, true) => args.model.check_used("arm ik --all --pose", &[]),
+        (true, false) => args.model.check_used("arm ik --all", &["--tool-axis"]),
+        (false, true) => args
+            .model
+            .check_used("arm ik --pose", &["--max-rate-rad-s"]),
+        (false, false) => args
+            .model
+            .check_used("arm ik", &["--tool-axis", "--max-rate-rad-s"]),
+    }?;
     let model = args.model.load()?;
+    let free = model.free_joints(if args.pose { 6 } else { 5 });
+    if args.all && free > 0 {
+        eprintln!(
+            "rover: an arm of {} joints reaches {} in a continuum of postures: the rows are samples \
+             of it, not all of them",
+            model.arm.joint_count(),
+            if args.pose {
+                "a pose"
+            } else {
+                "a point with an axis"
+            }
+        );
+    }
     let near = match &args.near {
         None => model.middle(),
         Some(text) => model.joints("--near", text)?,

@@ -13,7 +13,7 @@ use clap::Subcommand;
 ///
 /// A model file is CAHV text, TOML, ROS CameraInfo YAML, OpenCV YAML or a Kalibr chain; `-` is standard
 /// input. Of a file with several cameras FILE#N is the one that the file numbers N: cam1 of a Kalibr
-/// chain, M2 of an OpenCV stereo file.
+/// chain, M2 of an OpenCV stereo file. Both models of a pair must be given in one frame.
 #[derive(Clone, Debug, clap::Args)]
 pub struct CameraArgs {
     #[command(subcommand)]

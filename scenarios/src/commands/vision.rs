@@ -1,17 +1,18 @@
 //! `rover vision`: fiducials and stereo on a person's own images.
 
 mod disparity;
+mod doubt;
 mod evaluate;
 mod find;
-mod input;
+pub(super) mod input;
 mod stereo;
 
 use super::{CommandError, Exit};
 
 /// Finds fiducials, matches pixels and measures surfaces in images of one's own
 ///
-/// Images are PNG or PGM, 8 or 16 bit; colour is converted to grey. Pixel (0, 0) is the centre of
-/// the first pixel. Camera models are of any format that `rover camera` reads. Exit code 3: the images hold no
+/// Images are PNG, PNM (PGM, PPM), JPEG or BMP, turned upright as their EXIF orientation says; colour
+/// and 16 bits are converted to grey of 8. Pixel (0, 0) is the centre of the first pixel. Camera models are of any format that `rover camera` reads. Exit code 3: the images hold no
 /// answer, and the output says why.
 #[derive(Clone, Debug, clap::Args)]
 pub struct VisionArgs {

@@ -1,22 +1,20 @@
 //! Reading a table.
 
-use super::{OK, STATUS, TableError, names::nearest};
+use super::{OK, STATUS, TableError, lines::Lines, names::nearest};
 use csv::{ByteRecord, Reader, ReaderBuilder};
+use rover_files::FileError;
 use std::{
     fs::File,
     io::{self, Read},
     path::Path,
 };
 
-/// The longest line that is read, bytes.
-const LONGEST_LINE: usize = 64 * 1024;
-
 /// A table that is being read; an iterator over its rows.
 pub struct Table {
     file: String,
     columns: Vec<String>,
     has_status: bool,
-    rows: Reader<Lines<Box<dyn Read>>>,
+    rows: Reader<Lines>,
     record: ByteRecord,
     ended: bool,
 }
@@ -34,7 +32,10 @@ impl Table {
         let file = path.display().to_string();
         match File::open(path) {
             Ok(source) => Self::from_reader(&file, Box::new(source), columns),
-            Err(source) => Err(TableError::Open { file, source }),
+            Err(source) => Err(TableError::Open {
+                file,
+                source: source.into(),
+            }),
         }
     }
 
@@ -47,14 +48,15 @@ impl Table {
         source: Box<dyn Read>,
         columns: &[impl AsRef<str>],
     ) -> Result<Self, TableError> {
+        let columns: Vec<String> = columns.iter().map(|c| c.as_ref().to_owned()).collect();
         let mut table = Self {
             file: file.into(),
-            columns: columns.iter().map(|c| c.as_ref().to_owned()).collect(),
+            columns: columns.clone(),
             has_status: false,
             rows: ReaderBuilder::new()
                 .has_headers(false)
                 .flexible(true)
-                .from_reader(Lines::new(source)),
+                .from_reader(Lines::new(source, columns)),
             record: ByteRecord::new(),
             ended: false,
         };
@@ -89,13 +91,13 @@ impl Table {
     fn advance(&mut self) -> Result<Option<u64>, TableError> {
         match self.rows.read_byte_record(&mut self.record) {
             Ok(false) => Ok(None),
-            // The reader stands behind the end of the record's line.
-            Ok(true) => Ok(Some(self.rows.position().line().saturating_sub(1))),
+            // Lines are handed on one at a time.
+            Ok(true) => Ok(Some(self.rows.get_ref().line())),
             Err(error) => Err(TableError::Read {
                 file: self.file.clone(),
-                line: self.rows.get_ref().line,
+                line: self.rows.get_ref().line(),
                 what: match error.into_kind() {
-                    csv::ErrorKind::Io(e) => e.to_string(),
+                    csv::ErrorKind::Io(e) => FileError::from(e).to_string(),
                     other => format!("{other:?}"),
                 },
             }),
@@ -243,7 +245,7 @@ fn check_header(found: &[String], expected: &[String]) -> Option<String> {
     ))
 }
 
-fn number(cell: &[u8]) -> Option<f64> {
+pub(super) fn number(cell: &[u8]) -> Option<f64> {
     let value: f64 = std::str::from_utf8(cell).ok()?.trim().parse().ok()?;
     value.is_finite().then_some(value)
 }
@@ -256,71 +258,4 @@ fn shortened(cell: &[u8]) -> String {
         short.push('…');
     }
     short.escape_debug().to_string()
-}
-
-/// Passes bytes on with plain line ends, the last one included, and refuses what would make the reader gather without bound: a line longer than
-/// [`LONGEST_LINE`], and a quoted cell that does not end on its line.
-struct Lines<R> {
-    inner: R,
-    line: u64,
-    length: usize,
-    quoted: bool,
-}
-
-impl<R> Lines<R> {
-    fn new(inner: R) -> Self {
-        Self {
-            inner,
-            line: 1,
-            length: 0,
-            quoted: false,
-        }
-    }
-}
-
-impl<R: Read> Read for Lines<R> {
-    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let refused = |what: String| Err(io::Error::new(io::ErrorKind::InvalidData, what));
-        if buffer.is_empty() {
-            return Ok(0);
-        }
-        let mut kept = 0;
-        while kept == 0 {
-            let read = self.inner.read(buffer)?;
-            if read == 0 {
-                // The last line may lack its end.
-                if self.length == 0 {
-                    return Ok(0);
-                }
-                buffer[0] = b'\n';
-                self.length = 0;
-                return Ok(1);
-            }
-            for i in 0..read {
-                let byte = buffer[i];
-                match byte {
-                    b'\r' => continue,
-                    b'\n' => {
-                        if self.quoted {
-                            return refused("a quoted cell does not end on its line".into());
-                        }
-                        self.line += 1;
-                        self.length = 0;
-                    }
-                    _ => {
-                        self.quoted ^= byte == b'"';
-                        self.length += 1;
-                        if self.length > LONGEST_LINE {
-                            return refused(format!(
-                                "the line is longer than {LONGEST_LINE} bytes"
-                            ));
-                        }
-                    }
-                }
-                buffer[kept] = byte;
-                kept += 1;
-            }
-        }
-        Ok(kept)
-    }
 }

@@ -40,6 +40,37 @@ fn marks_line_ends_quotes_and_blank_lines_of_other_tools_are_understood() {
 }
 
 #[test]
+fn comments_are_passed_over_and_lines_are_those_of_the_file() {
+    let text = "# of the rig, \"day 2\n\nx_m,y_m,z_m\n1,2,3\n  # far\n\n4,5,6\n7,8,x\n";
+    let mut table = table(text).unwrap();
+    let next = |table: &mut Table| table.next().unwrap();
+    assert_eq!(next(&mut table).unwrap().line(), 4);
+    assert_eq!(next(&mut table).unwrap().line(), 7);
+    let error = next(&mut table).unwrap_err().to_string();
+    assert!(error.starts_with("p.csv:8:3: `z_m` is `x`"), "{error}");
+}
+
+/// As `numpy.savetxt(..., delimiter=",", header="x_m,y_m,z_m")` writes it.
+#[test]
+fn a_comment_is_the_header_of_a_table_that_begins_with_numbers() {
+    for text in [
+        "# x_m,y_m,z_m\n1,2,3\n4,5,6\n",
+        "\u{feff}#x_m, y_m, z_m\n# more\n1,2,3\n4,5,6\n",
+        "# x_m,y_m,z_m\nx_m,y_m,z_m\n1,2,3\n4,5,6\n",
+        "# x_m,y_m,z_m,status\n1,2,3,ok\n4,5,6,ok\n",
+    ] {
+        assert_eq!(rows(text), [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], "{text}");
+    }
+    assert_eq!(rows("# x_m,y_m,z_m\n"), Vec::<[f64; 3]>::new());
+    for other in ["# x_m,y_m\n1,2,3\n", "1,2,3\n# x_m,y_m,z_m\n"] {
+        let message = refusal(other);
+        assert!(message.contains("the first line has numbers"), "{message}");
+    }
+    let message = refusal("# x_m,y_m,z_m\n1,2\n");
+    assert_eq!(message, "p.csv:2: 2 cells, 3 expected as in the header");
+}
+
+#[test]
 fn a_wrong_header_is_refused_with_the_name_that_was_meant() {
     for (header, part) in [
         (

@@ -2,6 +2,7 @@
 
 use super::{OK, STATUS, TableError};
 use crate::output::{Output, OutputError};
+use rover_files::FileError;
 use std::{
     fs::{self, File},
     io::{self, BufWriter, Write},
@@ -43,7 +44,7 @@ impl TableWriter {
                 let name = path.display().to_string();
                 let failed = |source| OutputError::File {
                     path: name.clone(),
-                    source,
+                    source: FileError::writing(source),
                 };
                 if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
                     fs::create_dir_all(folder).map_err(failed)?;
@@ -152,7 +153,7 @@ impl TableWriter {
         }
         Err(TableError::Output(OutputError::File {
             path: self.file.clone(),
-            source,
+            source: FileError::writing(source),
         }))
     }
 

@@ -6,7 +6,10 @@
 //! Such a file is a store of anything: other names in it are not looked at, but those that would
 //! change what the numbers mean are refused. A single camera has no pose: the model is in its own
 //! axes (x right, y down, z forward). So is the first camera of a pair; the second is given in the
-//! axes of the first if `R` and `T` are there.
+//! axes of the first if `R` and `T` are there, or in a second file (`extrinsics.yml` beside
+//! `intrinsics.yml`, as OpenCV's `stereo_calib` writes them). `T` has the unit that the squares of
+//! the board were given in; the file does not say which. `R1`, `R2`, `P1`, `P2`, `Q` follow from the
+//! rest and are not looked at.
 
 use super::lens::{Lens, LensCamera};
 use super::pose::rotation;
@@ -18,12 +21,17 @@ use serde::Deserialize;
 use serde::de::IgnoredAny;
 
 /// What to take from a file.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Choice {
     /// Which camera of a stereo pair: 1 or 2, as in `M1` and `M2`. The first if it is not given.
     pub number: Option<usize>,
     /// Width and height of the image, px, for a file that does not say.
     pub size_px: Option<[u32; 2]>,
+    /// Takes the first camera's axes to the second's, in the unit of `T`: [`read_extrinsics`] of
+    /// another file.
+    pub second_from_first: Option<Isometry3<f64>>,
+    /// The unit of `T`, m; metres if not given.
+    pub unit_m: Option<f64>,
 }
 
 /// A camera of a file.
@@ -191,6 +199,55 @@ impl File {
         let shift = Translation3::new(t[0], t[1], t[2]);
         Ok(Some(Isometry3::from_parts(shift, rotation("R", &turn)?)))
     }
+
+    /// The pose of the chosen camera of a pair, in metres, if it is not in its own axes: takes the
+    /// first camera's axes to the second's.
+    fn pose_of(
+        &self,
+        number: Option<usize>,
+        choice: &Choice,
+    ) -> Result<Option<Isometry3<f64>>, FormatError> {
+        let pose = match (number, self.second_from_first()?, choice.second_from_first) {
+            (Some(2), Some(_), Some(_)) => {
+                return Err(wrong(
+                    "R, T",
+                    "both here and in --extrinsics",
+                    "one of them",
+                ));
+            }
+            (Some(2), here, there) => here.or(there),
+            (_, _, Some(_)) => {
+                return Err(wrong(
+                    "--extrinsics",
+                    "a pose for the second camera of a pair",
+                    "the second camera chosen, as FILE#2, of a file with M1, D1, M2, D2",
+                ));
+            }
+            _ => None,
+        };
+        match (pose, choice.unit_m) {
+            (None, Some(_)) => Err(wrong(
+                "--unit-m",
+                "no T to which it applies",
+                "the second camera of a pair, as FILE#2, with its R and T",
+            )),
+            (Some(pose), Some(unit_m)) => Ok(Some(Isometry3::from_parts(
+                Translation3::from(pose.translation.vector * unit_m),
+                pose.rotation,
+            ))),
+            (pose, None) => Ok(pose),
+        }
+    }
+}
+
+/// Reads `R` and `T` of a file that holds them without the cameras: takes the first camera's axes to
+/// the second's, in the unit of `T`.
+///
+/// # Errors
+/// As [`read_chosen`].
+pub fn read_extrinsics(text: &str) -> Result<Isometry3<f64>, FormatError> {
+    let found = parse(text)?.second_from_first()?;
+    found.ok_or_else(|| wrong("R, T", "nothing", "the pose of the second camera of a pair"))
 }
 
 /// Whether a text is of this format: it says so in its first line or names its matrices.
@@ -212,24 +269,15 @@ pub fn read(text: &str) -> Result<LensCamera, FormatError> {
 /// [`FormatError::Structure`] with line and column, [`FormatError::Field`], or
 /// [`FormatError::Camera`].
 pub fn read_chosen(text: &str, choice: &Choice) -> Result<Found, FormatError> {
-    if text.len() > MAX_BYTES {
-        return Err(FormatError::TooLong { found: text.len() });
-    }
-    // `%YAML:1.0` and `!!opencv-matrix` are OpenCV's own; blanks of the same length keep the
-    // places that an error names.
-    let text = text
-        .strip_prefix('\u{feff}')
-        .unwrap_or(text)
-        .replace("!!opencv-matrix", "               ");
-    let text = match text.strip_prefix("%YAML:") {
-        Some(rest) => {
-            let end = rest.find('\n').unwrap_or(rest.len());
-            format!("#{}", &rest[end..])
-        }
-        None => text,
-    };
-    let file: File = yaml::read(&text)?;
+    let file = parse(text)?;
     let pair = file.camera_matrix.is_none() && (file.m1.is_some() || file.m2.is_some());
+    if !pair && file.camera_matrix.is_none() && file.turn.is_some() && file.shift.is_some() {
+        return Err(wrong(
+            "camera_matrix",
+            "R and T of a pair alone",
+            "the cameras: this is the file that goes with theirs as --extrinsics",
+        ));
+    }
     let number = match (pair, choice.number) {
         (false, None) => None,
         (true, None | Some(1)) => Some(1),
@@ -277,10 +325,7 @@ pub fn read_chosen(text: &str, choice: &Choice) -> Result<Found, FormatError> {
             ));
         }
     };
-    let pose = match number {
-        Some(2) => file.second_from_first()?,
-        _ => None,
-    };
+    let pose = file.pose_of(number, choice)?;
     let camera = LensCamera {
         frame_from_camera: pose.map_or_else(Isometry3::identity, |pose| pose.inverse()),
         focal_px,
@@ -299,6 +344,26 @@ pub fn read_chosen(text: &str, choice: &Choice) -> Result<Found, FormatError> {
         number,
         frame,
     })
+}
+
+fn parse(text: &str) -> Result<File, FormatError> {
+    if text.len() > MAX_BYTES {
+        return Err(FormatError::TooLong { found: text.len() });
+    }
+    // `%YAML:1.0` and `!!opencv-matrix` are OpenCV's own; blanks of the same length keep the
+    // places that an error names.
+    let text = text
+        .strip_prefix('\u{feff}')
+        .unwrap_or(text)
+        .replace("!!opencv-matrix", "               ");
+    let text = match text.strip_prefix("%YAML:") {
+        Some(rest) => {
+            let end = rest.find('\n').unwrap_or(rest.len());
+            format!("#{}", &rest[end..])
+        }
+        None => text,
+    };
+    yaml::read(&text)
 }
 
 /// Writes a camera. Its pose has no place in the file.

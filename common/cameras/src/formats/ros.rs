@@ -7,7 +7,9 @@
 //! column not zero, the model is therefore given in the axes of the rectified left camera
 //! ([`RECTIFIED`]: x right along the baseline, y down, z forward), the same for both cameras of the
 //! pair. Otherwise (and if they are missing or all zeros) it is in the camera's own axes (x right,
-//! y down, z forward; `camera_optical` unless the file names its frame). What else `P` says, the
+//! y down, z forward; `camera_optical` unless the file names its frame): for the left camera of a
+//! pair that was taken rectified these are the same axes, but the file of a camera without a partner
+//! looks alike. What else `P` says, the
 //! focal lengths of the rectified image, is not used.
 
 use super::lens::{Lens, LensCamera};
@@ -29,6 +31,9 @@ pub struct CameraInfo {
     pub camera: LensCamera,
     /// Whether `R` and `P` gave it a pose.
     pub posed: bool,
+    /// Whether `R` and `P` are there and do nothing: if this is the left camera of a rectified pair,
+    /// its own axes are those of [`RECTIFIED`].
+    pub may_be_left: bool,
     /// `camera_name`, or the frame of the message's header.
     pub name: Option<String>,
 }
@@ -239,12 +244,21 @@ pub fn read(text: &str) -> Result<CameraInfo, FormatError> {
         lens,
     };
     camera.validate()?;
+    let says = |matrix: &Option<Matrix>| {
+        matrix
+            .as_ref()
+            .is_some_and(|m| m.data.iter().any(|x| *x != 0.0))
+    };
+    let may_be_left = frame_from_camera.is_none()
+        && says(&file.rectification_matrix)
+        && says(&file.projection_matrix);
     let name = file
         .camera_name
         .or_else(|| file.header.and_then(|header| header.frame_id));
     Ok(CameraInfo {
         camera,
         posed: frame_from_camera.is_some(),
+        may_be_left,
         name,
     })
 }

@@ -7,7 +7,7 @@ use serde::de::DeserializeOwned;
 const MAX_DEPTH: usize = 12;
 
 /// Reads one YAML document; a mark that ends it (`---` as `ros2 topic echo` prints it, or `...`) may
-/// follow. Aliases, which can make a short text long, are refused.
+/// follow, and comments behind it. A second document is refused. Aliases, which can make a short text long, are refused.
 pub(super) fn read<T: DeserializeOwned>(text: &str) -> Result<T, FormatError> {
     if text.len() > MAX_BYTES {
         return Err(FormatError::TooLong { found: text.len() });
@@ -23,7 +23,7 @@ pub(super) fn read<T: DeserializeOwned>(text: &str) -> Result<T, FormatError> {
         },
     };
     serde_saphyr::from_str_with_options(without_mark(text), options).map_err(|error| {
-        let message = brief(&error.without_snippet().to_string());
+        let message = plain(&brief(&error.without_snippet().to_string()));
         let message = match line_of(&message).and_then(|n| text.lines().nth(n.checked_sub(1)?)) {
             Some(line) => format!("{message}: `{}`", shown(&brief(line))),
             None => message,
@@ -39,14 +39,31 @@ fn line_of(message: &str) -> Option<usize> {
     rest[..digits.unwrap_or(rest.len())].parse().ok()
 }
 
-/// The text without a last line that only ends the document.
+/// What the reader says in terms of its own options, in terms of the file.
+fn plain(message: &str) -> String {
+    if message.starts_with("budget breached: Documents")
+        && let Some(line) = line_of(message)
+    {
+        return format!("a second document begins at line {line}, expected one");
+    }
+    message
+        .replace(", set DuplicateKeyPolicy in Options if acceptable", "")
+        .replace("simple key expected ':'", "expected `name: value`")
+}
+
+/// The text without a last mark that only ends the document, and what is blank or comment behind it.
 fn without_mark(text: &str) -> &str {
-    let end = text.trim_end();
-    ["---", "..."]
-        .iter()
-        .filter_map(|mark| end.strip_suffix(mark))
-        .find(|rest| rest.ends_with('\n'))
-        .unwrap_or(text)
+    let mut end = text;
+    loop {
+        let start = end.trim_end().rfind('\n').map_or(0, |n| n + 1);
+        match end[start..].trim() {
+            "---" | "..." if start > 0 => return &end[..start],
+            line if start > 0 && (line.is_empty() || line.starts_with('#')) => {
+                end = &end[..start];
+            }
+            _ => return text,
+        }
+    }
 }
 
 /// A number as YAML 1.1 and 1.2 both read it: with a point, and a sign in the exponent.

@@ -122,7 +122,17 @@ fn both_cameras_of_an_opencv_stereo_file_are_read() {
     let size_px = Some([640, 480]);
     for names in [["M1", "D1", "M2", "D2"], ["K1", "D1", "K2", "D2"]] {
         let text = stereo_file(names, true);
-        let found = |number| read_chosen(&text, &Choice { number, size_px }).unwrap();
+        let found = |number| {
+            read_chosen(
+                &text,
+                &Choice {
+                    number,
+                    size_px,
+                    ..Choice::default()
+                },
+            )
+            .unwrap()
+        };
         let (first, second) = (found(Some(1)), found(Some(2)));
         assert_eq!(found(None), first);
         assert_eq!(first.camera.focal_px, [500.0; 2]);
@@ -145,7 +155,16 @@ fn both_cameras_of_an_opencv_stereo_file_are_read() {
         assert!(error.amax() < 1e-9, "{error}");
     }
     let apart = stereo_file(["M1", "D1", "M2", "D2"], false);
-    let choice = |number, size_px| read_chosen(&apart, &Choice { number, size_px });
+    let choice = |number, size_px| {
+        read_chosen(
+            &apart,
+            &Choice {
+                number,
+                size_px,
+                ..Choice::default()
+            },
+        )
+    };
     let second = choice(Some(2), size_px).unwrap();
     assert_eq!(second.frame, "camera2_optical");
     assert_eq!(second.camera.frame_from_camera, Isometry3::identity());
@@ -158,8 +177,8 @@ fn both_cameras_of_an_opencv_stereo_file_are_read() {
 fn an_image_size_that_is_asked_for_must_be_that_of_the_file() {
     let text = fisheye("");
     let choice = |size_px| Choice {
-        number: None,
         size_px: Some(size_px),
+        ..Choice::default()
     };
     assert!(read_chosen(&text, &choice([640, 480])).is_ok());
     assert!(read_chosen(&text, &choice([320, 240])).is_err());

@@ -16,7 +16,8 @@ const ENDLESS_RAD: f64 = TAU;
 pub struct ChainOptions {
     /// Link that the arm stands on; the model's only root if not given.
     pub base: Option<String>,
-    /// Link that carries the tool; the only end of an arm of 4 to 7 joints if not given.
+    /// Link that carries the tool; if not given the only end of an arm of 4 to 7 joints, refused
+    /// where this arm has other ends.
     pub tip: Option<String>,
     /// Rate limit of joints that have none in the file, rad/s; [`NO_RATE_LIMIT_RAD_S`] if not given.
     pub max_rate_rad_s: Option<f64>,
@@ -129,7 +130,7 @@ impl Urdf {
             _ => {
                 let names = listed(roots.iter().map(|&l| self.links[l].name.as_str()));
                 Err(self.refused(format!(
-                    "several links have no parent, name the base: {names}"
+                    "several links have no parent, name the base (--base): {names}"
                 )))
             }
         }
@@ -176,23 +177,35 @@ impl Urdf {
             .collect();
         let counted = |(link, chain): &(usize, Vec<usize>)| {
             let name = &self.links[*link].name;
-            format!("{name} ({} moving joints)", self.moving(chain))
+            let n = self.moving(chain);
+            format!("{name} ({n} moving joint{})", if n == 1 { "" } else { "s" })
         };
-        let all: Vec<String> = ends.iter().map(counted).collect();
-        ends.retain(|(_, chain)| (MIN_JOINTS..=MAX_JOINTS).contains(&self.moving(chain)));
-        match ends.len() {
-            1 => Ok(ends.swap_remove(0)),
-            0 => Err(self.refused(format!(
-                "no end of an arm of {MIN_JOINTS} to {MAX_JOINTS} joints; the ends are {}",
-                listed(all.iter().map(String::as_str))
+        let is_arm = |chain: &[usize]| (MIN_JOINTS..=MAX_JOINTS).contains(&self.moving(chain));
+        let arms: Vec<usize> = (0..ends.len()).filter(|&n| is_arm(&ends[n].1)).collect();
+        // The ends that a moving joint of the first arm carries too: fingers, a camera at the elbow.
+        let moved: Vec<usize> = arms.first().map_or_else(Vec::new, |&n| {
+            let joints = ends[n].1.iter().copied();
+            let moving = joints.filter(|&j| self.joints[j].kind != JointKind::Fixed);
+            moving.collect()
+        });
+        let may = |n: usize| {
+            arms.is_empty() || arms.contains(&n) || ends[n].1.iter().any(|j| moved.contains(j))
+        };
+        let names: Vec<String> = (0..ends.len())
+            .filter(|&n| may(n))
+            .map(|n| counted(&ends[n]))
+            .collect();
+        let listed = listed(names.iter().map(String::as_str));
+        match (arms.len(), names.len()) {
+            (1, 1) => Ok(ends.swap_remove(arms[0])),
+            (0, _) => Err(self.refused(format!(
+                "no end of an arm of {MIN_JOINTS} to {MAX_JOINTS} joints; the ends are {listed}; a \
+                 link that is no end, such as a gripper's base, can be named as the tip (--tip)"
             ))),
-            _ => {
-                let names: Vec<String> = ends.iter().map(counted).collect();
-                let names = listed(names.iter().map(String::as_str));
-                Err(self.refused(format!(
-                    "several ends may carry the tool, name the tip: {names}"
-                )))
-            }
+            _ => Err(self.refused(format!(
+                "several ends may carry the tool, name the tip (--tip): {listed}; a link that is no \
+                 end, such as a gripper's base, can be it too"
+            ))),
         }
     }
 

@@ -22,9 +22,9 @@ impl Urdf {
     /// [`UrdfError`] with file and line.
     pub fn read(path: &Path, package_paths: &[PathBuf]) -> Result<Self, UrdfError> {
         let file = path.display().to_string();
-        let failed = |source| UrdfError::File {
+        let failed = |source: std::io::Error| UrdfError::File {
             file: file.clone(),
-            source,
+            source: source.into(),
         };
         let mut text = Vec::new();
         let source = std::fs::File::open(path).map_err(failed)?;

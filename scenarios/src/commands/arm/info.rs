@@ -63,6 +63,12 @@ struct Mesh {
 }
 
 #[derive(Serialize)]
+struct FreeJoints {
+    point_and_axis: usize,
+    pose: usize,
+}
+
+#[derive(Serialize)]
 struct Info {
     name: String,
     /// The frame that poses are given in.
@@ -73,6 +79,9 @@ struct Info {
     tool_axis_in_last: [f64; 3],
     reach_m: f64,
     inverse: String,
+    /// Joints beyond the five that a tool point with its axis fixes, and beyond the six of a pose:
+    /// with any, the answers are a continuum and `arm ik --all` gives samples of it.
+    free_joints_n: FreeJoints,
     postures: Vec<Posture>,
     meshes: Vec<Mesh>,
     notes: Vec<String>,
@@ -184,6 +193,10 @@ fn collect(model: &ArmModel) -> Result<Info, CommandError> {
         tool_axis_in_last: Vector3::from(model.tool.axis_in_link.into_inner()).into(),
         reach_m: arm.reach_m(model.tool.tip_in_link.norm()),
         inverse,
+        free_joints_n: FreeJoints {
+            point_and_axis: model.free_joints(5),
+            pose: model.free_joints(6),
+        },
         postures,
         meshes,
         notes,
@@ -203,6 +216,16 @@ fn text(info: &Info) -> String {
         info.frame
     ));
     line(format!("inverse kinematics: {}", info.inverse));
+    if info.free_joints_n.point_and_axis > 0 {
+        let six = if info.free_joints_n.pose > 0 {
+            ", and of a pose,"
+        } else {
+            ""
+        };
+        line(format!(
+            "answers of a tool point with its axis{six} are a continuum: `arm ik --all` gives samples"
+        ));
+    }
     line(format!("reach: at most {:.4} m", info.reach_m));
     let [x, y, z] = info.last_from_tool.position_m;
     let [ax, ay, az] = info.tool_axis_in_last;

@@ -23,14 +23,14 @@ pub struct ModelArgs {
     /// URDF: link whose origin is the tool point; the only end of an arm of 4 to 7 joints if not given
     #[arg(long, value_name = "LINK")]
     pub tip: Option<String>,
-    /// URDF: approach axis in the tip link; its z axis if not given
+    /// URDF: approach axis in the tip link; its z axis if not given (info; ik without --pose)
     #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true)]
     pub tool_axis: Option<String>,
-    /// URDF: folder that holds packages, or a package, for `package://` (repeatable)
+    /// URDF: folder that holds packages, or a package, for `package://` (info; repeatable)
     #[arg(long, value_name = "DIR")]
     pub package_path: Vec<PathBuf>,
     /// URDF: rate limit of joints that have none in the file; only the nearest of several answers
-    /// depends on it
+    /// depends on it (info; ik without --all)
     #[arg(long, value_name = "RATE")]
     pub max_rate_rad_s: Option<f64>,
 }
@@ -69,6 +69,37 @@ impl ModelArgs {
     pub fn is_urdf(&self) -> bool {
         let ending = self.robot.extension().and_then(|e| e.to_str());
         ending.is_some_and(|e| ["urdf", "xml", "xacro"].contains(&e.to_lowercase().as_str()))
+    }
+
+    /// Refuses options of a URDF that `verb` does not look at.
+    ///
+    /// # Errors
+    /// [`CommandError::BadInput`] naming the option and what it is for.
+    pub(super) fn check_used(&self, verb: &str, used: &[&str]) -> Result<(), CommandError> {
+        let options = [
+            (
+                "--tool-axis",
+                self.tool_axis.is_some(),
+                "`arm info`, and `arm ik` without --pose",
+            ),
+            (
+                "--package-path",
+                !self.package_path.is_empty(),
+                "`arm info`, which looks for the meshes",
+            ),
+            (
+                "--max-rate-rad-s",
+                self.max_rate_rad_s.is_some(),
+                "`arm info`, and `arm ik` without --all",
+            ),
+        ];
+        let idle = |(name, is_given, _): &&(&str, bool, &str)| *is_given && !used.contains(name);
+        match options.iter().find(idle) {
+            Some((name, _, place)) if self.is_urdf() => Err(CommandError::BadInput(format!(
+                "{name} has no effect on `{verb}`: it is for {place}"
+            ))),
+            _ => Ok(()),
+        }
     }
 
     /// Reads and checks it.
@@ -146,6 +177,12 @@ impl ArmModel {
     /// As [`Arm::forward`].
     pub fn forward(&self, q: &[f64]) -> Result<Isometry3<f64>, ArmError> {
         Ok(self.base_from_arm_base * self.arm.forward(q)? * self.last_from_tool)
+    }
+
+    /// Joints beyond those that a goal of `fixed` conditions fixes; where there are any its answers
+    /// are a continuum.
+    pub fn free_joints(&self, fixed: usize) -> usize {
+        self.arm.joint_count().saturating_sub(fixed)
     }
 
     /// The middle of the joint limits, rad.

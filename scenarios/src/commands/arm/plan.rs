@@ -49,7 +49,12 @@ pub struct PlanArgs {
     #[arg(long, value_name = "POINTS.csv")]
     pub terrain: Option<PathBuf>,
     /// Radius about the tool point within which the instrument may touch the terrain, m
-    #[arg(long, value_name = "RADIUS", default_value_t = 0.0)]
+    #[arg(
+        long,
+        value_name = "RADIUS",
+        default_value_t = 0.0,
+        requires_all = ["terrain", "to_tool"]
+    )]
     pub contact_radius_m: f64,
     /// Fraction of the rate and acceleration limits to use
     #[arg(long, value_name = "FRACTION", default_value_t = 1.0)]

@@ -4,7 +4,10 @@ mod page;
 mod report;
 
 use super::files::json;
-use crate::{commands::CommandError, output::Output};
+use crate::{
+    commands::{CommandError, vision::input::image},
+    output::Output,
+};
 use anyhow::anyhow;
 use nalgebra::Vector2;
 use rover_cameras::{
@@ -15,7 +18,6 @@ use rover_cameras::{
     formats::write_text,
 };
 use rover_vision::board::{Chessboard, find_chessboard};
-use rover_vision::image::Image8;
 use std::path::{Path, PathBuf};
 
 /// Calibrates a stereo pair, or one camera, from pictures of a printed chessboard
@@ -283,7 +285,7 @@ fn find(
         for (camera, images) in cameras.iter().enumerate() {
             let path: &Path = &images[n];
             let bad = |what: String| CommandError::BadInput(format!("{}: {what}", path.display()));
-            let image = Image8::read(path).map_err(|e| CommandError::BadInput(e.to_string()))?;
+            let image = image(path)?;
             let size = [image.width_px, image.height_px];
             let expected = *sizes_px[camera].get_or_insert(size);
             if size != expected {

@@ -1,8 +1,7 @@
 //! `rover camera convert`: between the formats of model files.
 
-use super::files::{self, Format, express, load};
+use super::files::{self, About, Format, express, load};
 use crate::{commands::CommandError, output::Output};
-use rover_cameras::formats::ConversionRules;
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -20,16 +19,12 @@ pub(super) struct ConvertArgs {
     /// for YAML)
     #[arg(long, value_name = "FORMAT")]
     to: Option<Format>,
-    /// Largest pixel error that is accepted
-    #[arg(long, value_name = "PX", default_value_t = 0.1)]
-    limit_px: f64,
     /// Nearest range at which the two shall agree; matters for a lens with a moving pupil
     #[arg(long, value_name = "M", default_value_t = 0.5)]
     near_m: f64,
-    /// Image size, if the input does not give it
-    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size)]
-    size: Option<[u32; 2]>,
-    /// Names the frame of the vectors
+    #[command(flatten)]
+    about: About,
+    /// Names the frame of the vectors (cahv, toml; the camera in ros)
     #[arg(long, value_name = "NAME")]
     frame: Option<String>,
     /// Cuts out a part of the image: column, row, width, height
@@ -46,29 +41,15 @@ pub(super) struct ConvertArgs {
     force: bool,
 }
 
-fn numbers<const N: usize>(text: &str, by: char) -> Option<[u32; N]> {
-    let all: Option<Vec<u32>> = text.split(by).map(|x| x.trim().parse().ok()).collect();
-    all?.try_into().ok()
-}
-
-fn size(text: &str) -> Result<[u32; 2], String> {
-    numbers(text, 'x')
-        .filter(|s| !s.contains(&0))
-        .ok_or_else(|| "expected WIDTHxHEIGHT in whole pixels, e.g. 640x480".into())
-}
-
 fn four(text: &str) -> Result<[u32; 4], String> {
-    numbers(text, ',').ok_or_else(|| "expected U,V,W,H in whole pixels".into())
+    let all: Option<Vec<u32>> = text.split(',').map(|x| x.trim().parse().ok()).collect();
+    all.and_then(|all| all.try_into().ok())
+        .ok_or_else(|| "expected U,V,W,H in whole pixels".into())
 }
 
 /// Runs the verb.
 pub(super) fn run(args: &ConvertArgs) -> Result<(), CommandError> {
-    if !(args.limit_px >= 0.0 && args.near_m > 0.0 && args.near_m.is_finite()) {
-        return Err(CommandError::BadInput(format!(
-            "--limit-px {} --near-m {}: expected numbers above 0",
-            args.limit_px, args.near_m
-        )));
-    }
+    let rules = args.about.rules(args.near_m)?;
     let format = args
         .to
         .or_else(|| files::by_extension(&args.output))
@@ -78,27 +59,19 @@ pub(super) fn run(args: &ConvertArgs) -> Result<(), CommandError> {
                 args.output.display()
             ))
         })?;
+    if args.frame.is_some() && matches!(format, Format::Opencv | Format::Kalibr) {
+        return Err(CommandError::BadInput(
+            "--frame has no effect on opencv and kalibr files: they name no frame".into(),
+        ));
+    }
     let output = Output::open(&args.output, args.force)?;
     let report = args
         .json
         .as_deref()
         .map(|path| Output::open(path, args.force))
         .transpose()?;
-    let rules = ConversionRules {
-        limit_px: args.limit_px,
-        near_m: args.near_m,
-    };
-    let mut loaded = load(&args.input, &rules, args.size)?;
+    let mut loaded = load(&args.input, &rules, &args.about)?;
     loaded.report_notes();
-    if let Some(size) = args.size {
-        if let Some(given) = loaded.file.size_px.filter(|given| *given != size) {
-            return Err(CommandError::BadInput(format!(
-                "--size {}x{}: {} says {} x {} px",
-                size[0], size[1], loaded.name, given[0], given[1]
-            )));
-        }
-        loaded.file.size_px = Some(size);
-    }
     if args.subframe.is_some() || args.downsample.is_some() {
         let mut camera = loaded.camera()?;
         let wrong = |e: rover_cameras::CameraError| CommandError::BadInput(e.to_string());

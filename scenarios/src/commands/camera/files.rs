@@ -9,10 +9,11 @@ use rover_cameras::{
         ModelFile, kalibr, opencv, read_text, read_toml, ros, write_text, write_toml,
     },
 };
+use rover_files::FileError;
 use std::{
     fs::File,
     io::{self, Read},
-    path::Path,
+    path::{Path, PathBuf},
 };
 
 /// The frame of a model that has no pose.
@@ -42,6 +43,55 @@ pub(super) struct Fidelity {
     pub(super) covered: f64,
 }
 
+/// What a person says about a model file beside its name.
+#[derive(Clone, Debug, clap::Args)]
+pub(super) struct About {
+    /// Largest pixel error that is accepted of a lens that must be fitted
+    #[arg(long, value_name = "PX", default_value_t = ConversionRules::default().limit_px)]
+    pub(super) limit_px: f64,
+    /// Image size, if the file does not give it (OpenCV stereo files do not)
+    #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size)]
+    size: Option<[u32; 2]>,
+    /// R and T of an OpenCV stereo file MODEL#2, if they are in another file, as stereo_calib writes it
+    #[arg(long, value_name = "FILE")]
+    extrinsics: Option<PathBuf>,
+    /// Unit of T of an OpenCV stereo file MODEL#2, as the squares of the board were given [default: 1]
+    #[arg(long, value_name = "M")]
+    unit_m: Option<f64>,
+}
+
+impl Default for About {
+    fn default() -> Self {
+        Self {
+            limit_px: ConversionRules::default().limit_px,
+            size: None,
+            extrinsics: None,
+            unit_m: None,
+        }
+    }
+}
+
+impl About {
+    /// The rules of conversion: the two models shall agree from `near_m` on, m.
+    pub(super) fn rules(&self, near_m: f64) -> Result<ConversionRules, CommandError> {
+        let limit_px = self.limit_px;
+        if limit_px >= 0.0 && near_m > 0.0 && near_m.is_finite() {
+            return Ok(ConversionRules { limit_px, near_m });
+        }
+        Err(CommandError::BadInput(format!(
+            "--limit-px {limit_px} --near-m {near_m}: expected numbers above 0"
+        )))
+    }
+}
+
+fn size(text: &str) -> Result<[u32; 2], String> {
+    let sides = text.split_once('x').and_then(|(w, h)| {
+        let side = |text: &str| text.trim().parse().ok().filter(|n: &u32| *n > 0);
+        Some([side(w)?, side(h)?])
+    });
+    sides.ok_or_else(|| "expected WIDTHxHEIGHT in whole pixels, e.g. 640x480".into())
+}
+
 /// A model that was read, whatever it was written in.
 pub(in crate::commands) struct Loaded {
     /// The file's name for messages.
@@ -52,6 +102,8 @@ pub(in crate::commands) struct Loaded {
     pub(super) fidelity: Option<Fidelity>,
     /// What a person should know about how the file was read.
     notes: Vec<String>,
+    /// Whether its own axes are those of the rectified left camera, if it is that one.
+    may_be_left: bool,
 }
 
 impl Loaded {
@@ -77,12 +129,28 @@ fn bad(name: &str, error: &dyn std::fmt::Display) -> CommandError {
     CommandError::BadInput(format!("{name}: {error}"))
 }
 
-/// Reads a model; one that is not of the CAHV family is converted under `rules`. `size_px` is the image
-/// size for a file that does not give it.
+/// Refuses two models of a pair that are not given in one frame.
+pub(in crate::commands) fn check_one_frame(
+    left: &Loaded,
+    right: &Loaded,
+) -> Result<(), CommandError> {
+    let (Some(l), Some(r)) = (&left.file.frame, &right.file.frame) else {
+        return Ok(());
+    };
+    if l == r || (left.may_be_left && r == ros::RECTIFIED) {
+        return Ok(());
+    }
+    Err(CommandError::BadInput(format!(
+        "{} is given in the frame `{l}`, {} in `{r}`: expected one frame",
+        left.name, right.name
+    )))
+}
+
+/// Reads a model; one that is not of the CAHV family is converted under `rules`.
 pub(super) fn load(
     path: &Path,
     rules: &ConversionRules,
-    size_px: Option<[u32; 2]>,
+    about: &About,
 ) -> Result<Loaded, CommandError> {
     let (path, member) = member(path)?;
     let (name, text) = text(&path)?;
@@ -95,8 +163,23 @@ pub(super) fn load(
             format!("no camera #{n}: only Kalibr chains and OpenCV stereo files have several");
         return Err(bad(&name, &why));
     }
-    let mut notes = Vec::new();
-    let (file, fidelity) = match format {
+    for (option, is_given) in [
+        ("--extrinsics", about.extrinsics.is_some()),
+        ("--unit-m", about.unit_m.is_some()),
+    ] {
+        if is_given && format != Format::Opencv {
+            let why = format!("{option} is for an OpenCV stereo file");
+            return Err(bad(&name, &why));
+        }
+    }
+    if let Some(unit_m) = about.unit_m
+        && !(unit_m.is_finite() && unit_m > 0.0)
+    {
+        let why = format!("--unit-m {unit_m}: expected a number above 0");
+        return Err(CommandError::BadInput(why));
+    }
+    let (mut notes, mut may_be_left) = (Vec::new(), false);
+    let (mut file, fidelity) = match format {
         Format::Cahv => (read_text(&text).map_err(fail)?, None),
         Format::Toml => (read_toml(&text).map_err(fail)?, None),
         Format::Ros => {
@@ -115,12 +198,29 @@ pub(super) fn load(
             } else {
                 info.name.unwrap_or_else(|| OWN_AXES.into())
             };
+            may_be_left = info.may_be_left;
+            if may_be_left {
+                notes.push(format!(
+                    "its R and P leave it in its own axes, frame `{frame}`; if it is the left camera \
+                     of a rectified pair, they are those of the right one too ({})",
+                    ros::RECTIFIED
+                ));
+            }
             converted(&name, &info.camera, &frame, rules)?
         }
         Format::Opencv => {
+            let second_from_first = match &about.extrinsics {
+                None => None,
+                Some(path) => {
+                    let (name, text) = self::text(path)?;
+                    Some(opencv::read_extrinsics(&text).map_err(|e| bad(&name, &e))?)
+                }
+            };
             let choice = opencv::Choice {
                 number: member,
-                size_px,
+                size_px: about.size,
+                second_from_first,
+                unit_m: about.unit_m,
             };
             let found = opencv::read_chosen(&text, &choice).map_err(fail)?;
             if member.is_none() && found.number.is_some() {
@@ -129,7 +229,22 @@ pub(super) fn load(
                 ));
             }
             if found.number == Some(2) && found.frame != "camera1_optical" {
-                notes.push("no R and T in the file: the second camera is in its own axes".into());
+                notes.push(
+                    "no R and T in the file: the second camera is in its own axes; `rover camera \
+                     convert --extrinsics FILE` takes them from another"
+                        .into(),
+                );
+            } else if found.number == Some(2) {
+                let unit = about.unit_m.unwrap_or(1.0);
+                notes.push(format!(
+                    "pose by R and T in the axes of the first camera: a baseline of {:.6} m, if the \
+                     unit of T is {unit} m ({})",
+                    found.camera.frame_from_camera.translation.vector.norm(),
+                    match about.unit_m {
+                        None => "the file does not say; `rover camera convert --unit-m` changes it",
+                        Some(_) => "--unit-m",
+                    }
+                ));
             }
             converted(&name, &found.camera, found.frame, rules)?
         }
@@ -146,18 +261,28 @@ pub(super) fn load(
             converted(&name, camera, "cam0", rules)?
         }
     };
+    if let Some([w, h]) = about.size {
+        if let Some(given) = file.size_px.filter(|given| *given != [w, h]) {
+            return Err(CommandError::BadInput(format!(
+                "--size {w}x{h}: {name} says {} x {} px",
+                given[0], given[1]
+            )));
+        }
+        file.size_px = Some([w, h]);
+    }
     Ok(Loaded {
         name,
         format,
         file,
         fidelity,
         notes,
+        may_be_left,
     })
 }
 
 /// Reads a model under the usual rules; a conversion that is not exact is reported.
 pub(in crate::commands) fn load_reported(path: &Path) -> Result<Loaded, CommandError> {
-    let loaded = load(path, &ConversionRules::default(), None)?;
+    let loaded = load(path, &ConversionRules::default(), &About::default())?;
     loaded.report_notes();
     if let Some(fidelity) = loaded.fidelity.filter(|f| !f.exact) {
         eprintln!(
@@ -236,7 +361,7 @@ fn text(path: &Path) -> Result<(String, String), CommandError> {
     } else {
         File::open(path).and_then(|file| file.take(limit).read_to_end(&mut bytes))
     };
-    read.map_err(|e| bad(&name, &e))?;
+    read.map_err(|e| bad(&name, &FileError::from(e)))?;
     if bytes.len() > MAX_BYTES {
         let found = format!("longer than the {MAX_BYTES} bytes of a model file");
         return Err(bad(&name, &found));

@@ -1,6 +1,6 @@
 //! `rover camera info`: what a model says in pinhole terms, and how far its field reaches.
 
-use super::files::{json, load};
+use super::files::{About, json, load};
 use crate::{
     commands::CommandError,
     output::{Output, print},
@@ -15,6 +15,8 @@ use std::{fmt::Write, path::PathBuf};
 pub(super) struct InfoArgs {
     /// Camera model
     model: PathBuf,
+    #[command(flatten)]
+    about: About,
     /// Writes the same as JSON; `-` is standard output, without the text
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -30,7 +32,8 @@ pub(super) fn run(args: &InfoArgs) -> Result<(), CommandError> {
         .as_deref()
         .map(|path| Output::open(path, args.force))
         .transpose()?;
-    let loaded = load(&args.model, &ConversionRules::default(), None)?;
+    let rules = args.about.rules(ConversionRules::default().near_m)?;
+    let loaded = load(&args.model, &rules, &args.about)?;
     loaded.report_notes();
     let size = loaded.file.size_px;
     // Without a size the terms are the same; only the field of view is not known.

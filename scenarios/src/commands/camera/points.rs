@@ -1,6 +1,6 @@
 //! `rover camera project | ray | triangulate`: tables of points and pixels.
 
-use super::files::{Loaded, load_reported};
+use super::files::{Loaded, check_one_frame, load_reported};
 use crate::{
     commands::CommandError,
     tables::{Table, TableWriter},
@@ -161,14 +161,7 @@ pub(super) fn ray(args: &RayArgs) -> Result<(), CommandError> {
 /// `rover camera triangulate`.
 pub(super) fn triangulate(args: &TriangulateArgs) -> Result<(), CommandError> {
     let (left, right) = (load_reported(&args.left)?, load_reported(&args.right)?);
-    if let (Some(l), Some(r)) = (&left.file.frame, &right.file.frame)
-        && l != r
-    {
-        return Err(CommandError::BadInput(format!(
-            "{} is given in the frame `{l}`, {} in `{r}`: expected one frame",
-            left.name, right.name
-        )));
-    }
+    check_one_frame(&left, &right)?;
     answer_all(
         &args.matches,
         &args.out,

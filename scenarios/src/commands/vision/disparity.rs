@@ -8,8 +8,8 @@ use rover_cameras::{Camera, StereoPair};
 use rover_vision::{DenseRules, Disparity, PairDisparityError, Rectifier};
 use serde::Serialize;
 
-use super::input;
 use super::stereo::PairArgs;
+use super::{doubt, input};
 use crate::commands::{CommandError, Exit};
 use crate::output::Output;
 
@@ -18,7 +18,8 @@ use crate::output::Output;
 /// Both images are rectified first; columns and rows are those of the rectified left image, whose
 /// camera the JSON summary names. A PNG has 16 bits: value / 64 is the disparity in px, 0 marks a
 /// pixel without an answer. A CSV has a row for every pixel, u_px,v_px,disparity_px,x_m,y_m,z_m,
-/// status, in the frame of the camera models. Ranges here are depths along the rectified cameras' axis;
+/// status, in the frame of the camera models. Pictures that seem exchanged, unrelated or the same are
+/// told. Ranges here are depths along the rectified cameras' axis;
 /// without --range-max-m the search begins at infinity, without --range-min-m it ends after as many
 /// disparities as the rules say. Exit code 3: no pixel has an answer.
 #[derive(Clone, Debug, clap::Args)]
@@ -74,6 +75,8 @@ struct Summary {
     png_no_answer: u16,
     rectified_left: Rectified,
     rectified_right: Rectified,
+    /// What speaks against the pictures: exchanged, of two scenes, or twice the same.
+    warnings: Vec<String>,
 }
 
 enum Form {
@@ -172,7 +175,12 @@ pub fn run(args: &DisparityArgs) -> Result<Exit, CommandError> {
         Form::Png => out.write_bytes(&found.encode_png(shift).map_err(|e| bad(&e))?)?,
         Form::Csv => out.write(&field.table())?,
     }
-    let summary = field.summary(&rules);
+    let mut summary = field.summary(&rules);
+    let share = 0.01 * summary.found_percent;
+    let search = (f64::from(shift), &rules);
+    summary
+        .warnings
+        .extend(doubt::of_disparities(&pair, (&left, &right), search, share));
     let depth = |d: Option<f64>| d.map_or("infinity".into(), |d| format!("{d:.3} m"));
     let [near, far] = summary.searched_depth_m.map(depth);
     eprintln!(
@@ -185,6 +193,9 @@ pub fn run(args: &DisparityArgs) -> Result<Exit, CommandError> {
             "rover: what is nearer than {near} cannot be matched, and may be matched wrongly: \
              --range-min-m extends the search"
         );
+    }
+    for warning in &summary.warnings {
+        eprintln!("rover: warning: {warning}");
     }
     if let Some(json) = json {
         input::write_json(&json, &summary)?;
@@ -265,6 +276,7 @@ impl Field<'_> {
             png_no_answer: 0,
             rectified_left: vectors(&self.pair.left, 0),
             rectified_right: vectors(&self.pair.right, self.shift_px),
+            warnings: Vec::new(),
         }
     }
 }

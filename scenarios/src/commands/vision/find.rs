@@ -20,12 +20,12 @@ pub struct FindArgs {
     /// What to look for
     #[arg(long, value_name = "KIND")]
     pub fiducial: Kind,
-    /// Searches around this pixel, instead of the whole image
+    /// Searches around this pixel, instead of the whole image (all but plate)
     #[arg(long, value_name = "U,V", value_parser = input::numbers::<2>, allow_hyphen_values = true)]
     pub near: Option<[f64; 2]>,
-    /// How far from --near, or from a predicted pose, in u and in v
-    #[arg(long, value_name = "PX", default_value_t = 20.0)]
-    pub radius: f64,
+    /// How far from --near, or from a predicted pose, in u and in v [default: 20]
+    #[arg(long, value_name = "PX")]
+    pub radius: Option<f64>,
     /// Picture to look for (template)
     #[arg(long, value_name = "PNG")]
     pub template: Option<PathBuf>,
@@ -36,21 +36,23 @@ pub struct FindArgs {
     /// Camera model (plate; apriltag, disc and template if their pose or plane is to count)
     #[arg(long, value_name = "FILE")]
     pub model: Option<PathBuf>,
-    /// Predicted pose in the frame of the camera model: x,y,z in m and quaternion w,x,y,z
+    /// Predicted pose in the frame of the camera model: x,y,z in m and quaternion w,x,y,z (plate,
+    /// template)
     #[arg(long, value_name = "X,Y,Z,W,I,J,K", value_parser = input::pose, allow_hyphen_values = true)]
     pub pose: Option<Isometry3<f64>>,
     /// Width of the picture, of the standard plate, or of a tag's border square
     #[arg(long, value_name = "M")]
     pub width_m: Option<f64>,
-    /// Layout of the plate as TOML, instead of the standard one of --width-m
+    /// Layout of the plate as TOML, instead of the standard one of --width-m (plate)
     #[arg(long, value_name = "FILE")]
     pub layout: Option<PathBuf>,
     /// Normal of the disc's plane in the frame of the camera model: the disc's true centre is given
+    /// (disc, with --model)
     #[arg(long, value_name = "X,Y,Z", value_parser = input::vector, allow_hyphen_values = true)]
     pub normal: Option<Vector3<f64>>,
-    /// Tag family
-    #[arg(long, value_name = "NAME", default_value = "tag36h11")]
-    pub family: String,
+    /// Tag family (apriltag) [default: tag36h11]
+    #[arg(long, value_name = "NAME")]
+    pub family: Option<String>,
     /// Thresholds of the detector as TOML; what it leaves out keeps its default
     #[arg(long, value_name = "FILE")]
     pub rules: Option<PathBuf>,
@@ -106,6 +108,7 @@ struct Report {
 
 /// Runs the command.
 pub fn run(args: &FindArgs) -> Result<Exit, CommandError> {
+    check(args)?;
     let out = Output::open(&args.json, args.force)?;
     let image = input::image(&args.image)?;
     let fiducial = args.fiducial.name();
@@ -139,11 +142,103 @@ pub fn run(args: &FindArgs) -> Result<Exit, CommandError> {
     Ok(exit)
 }
 
+/// Refuses an option that the kind of fiducial, or the other options, leave without effect.
+fn check(args: &FindArgs) -> Result<(), CommandError> {
+    use Kind::{Apriltag, Disc, Harris, Plate, Saddle, Template};
+    let refused = |what: String| Err(CommandError::BadInput(what));
+    let kind = args.fiducial;
+    if kind == Plate && args.near.is_some() {
+        return refused(
+            "--near has no meaning for a plate: predict its pose with --pose, or search the whole \
+             image"
+                .into(),
+        );
+    }
+    let options: [(&str, bool, &[Kind]); 9] = [
+        (
+            "--near",
+            args.near.is_some(),
+            &[Harris, Template, Disc, Saddle, Apriltag],
+        ),
+        ("--template", args.template.is_some(), &[Template]),
+        ("--warp", args.warp.is_some(), &[Template]),
+        (
+            "--model",
+            args.model.is_some(),
+            &[Template, Disc, Plate, Apriltag],
+        ),
+        ("--pose", args.pose.is_some(), &[Template, Plate]),
+        (
+            "--width-m",
+            args.width_m.is_some(),
+            &[Template, Plate, Apriltag],
+        ),
+        ("--layout", args.layout.is_some(), &[Plate]),
+        ("--normal", args.normal.is_some(), &[Disc]),
+        ("--family", args.family.is_some(), &[Apriltag]),
+    ];
+    for (name, _, kinds) in options.iter().filter(|(_, is_given, _)| *is_given) {
+        if !kinds.contains(&kind) {
+            let kinds: Vec<&str> = kinds.iter().map(|k| k.name()).collect();
+            return refused(format!(
+                "{name} has no meaning for --fiducial {}: it is for {}",
+                kind.name(),
+                kinds.join(", ")
+            ));
+        }
+    }
+    let posed = args.pose.is_some();
+    let idle = [
+        (
+            args.radius.is_some() && args.near.is_none() && !posed,
+            if kind == Plate {
+                "--radius has no effect without --pose"
+            } else {
+                "--radius has no effect without --near"
+            },
+        ),
+        (
+            kind == Disc && args.model.is_some() && args.normal.is_none(),
+            "--model has no effect on a disc without --normal",
+        ),
+        (
+            kind == Template && args.model.is_some() && !posed,
+            "--model has no effect on a template without --pose",
+        ),
+        (
+            kind == Template && args.width_m.is_some() && !posed,
+            "--width-m has no effect on a template without --pose",
+        ),
+        (
+            posed && args.warp.is_some(),
+            "--warp has no effect beside --pose: expected one of them",
+        ),
+        (
+            posed && args.near.is_some(),
+            "--near has no effect beside --pose: expected one of them",
+        ),
+        (
+            args.layout.is_some() && args.width_m.is_some(),
+            "--width-m has no effect beside --layout: expected one of them",
+        ),
+    ];
+    match idle.iter().find(|(is_idle, _)| *is_idle) {
+        Some((_, what)) => refused((*what).into()),
+        None => Ok(()),
+    }
+}
+
+impl FindArgs {
+    fn radius_px(&self) -> f64 {
+        self.radius.unwrap_or(20.0)
+    }
+}
+
 type Found = Result<Vec<Finding>, NoFinding>;
 
 fn detect(args: &FindArgs, image: &Image8) -> Result<Found, CommandError> {
     let window = match args.near {
-        Some(place) => find::near(image, place, args.radius)
+        Some(place) => find::near(image, place, args.radius_px())
             .map_err(|e| CommandError::BadInput(format!("--near: {e}")))?,
         None => Window::whole(image),
     };
@@ -177,31 +272,19 @@ fn detect(args: &FindArgs, image: &Image8) -> Result<Found, CommandError> {
                     "the plate's size",
                 )?),
             };
-            if args.near.is_some() {
-                return Err(CommandError::BadInput(
-                    "--near has no meaning for a plate: predict its pose with --pose, or search \
-                     the whole image"
-                        .into(),
-                ));
-            }
             let rules: DetectionRules = input::rules(rules)?;
-            let prediction = args.pose.as_ref().map(|pose| (pose, args.radius));
+            let prediction = args.pose.as_ref().map(|pose| (pose, args.radius_px()));
             find::plate(image, &camera, &layout, prediction, &rules).map(|one| vec![one])
         }
         Kind::Apriltag => {
             let rules = input::rules(rules)?;
+            let family = args.family.as_deref().unwrap_or("tag36h11");
             if args.width_m.is_none() && args.model.is_none() {
-                return Ok(find::tags(image, window, &args.family, None, &rules));
+                return Ok(find::tags(image, window, family, None, &rules));
             }
             let width_m = *need(args.width_m.as_ref(), "--width-m", "the tag's pose")?;
             let camera = camera("the tag's pose")?;
-            find::tags(
-                image,
-                window,
-                &args.family,
-                Some((&camera, width_m)),
-                &rules,
-            )
+            find::tags(image, window, family, Some((&camera, width_m)), &rules)
         }
     })
 }
@@ -222,7 +305,7 @@ fn template(args: &FindArgs, image: &Image8, window: Window) -> Result<Found, Co
             camera_frame_from_picture: pose,
             width_m: *need(args.width_m.as_ref(), "--width-m", "--pose")?,
         };
-        let found = find::warped_template(image, &picture, &appearance, args.radius, &rules);
+        let found = find::warped_template(image, &picture, &appearance, args.radius_px(), &rules);
         return Ok(found.map(|one| vec![one]));
     }
     if let Some([a, b, c, d]) = args.warp {
@@ -231,7 +314,7 @@ fn template(args: &FindArgs, image: &Image8, window: Window) -> Result<Found, Co
             place_px: Vector2::from(*near),
             image_from_picture: Matrix2::new(a, b, c, d),
         };
-        let found = find::warped_template(image, &picture, &appearance, args.radius, &rules);
+        let found = find::warped_template(image, &picture, &appearance, args.radius_px(), &rules);
         return Ok(found.map(|one| vec![one]));
     }
     let window = match args.near {
@@ -239,8 +322,8 @@ fn template(args: &FindArgs, image: &Image8, window: Window) -> Result<Found, Co
         // the middle stays within the radius, the picture reaches beyond
         Some([u, v]) => {
             let (w, h) = (f64::from(picture.width_px), f64::from(picture.height_px));
-            let across = find::near(image, [u, v], args.radius + 0.5 * w);
-            let down = find::near(image, [u, v], args.radius + 0.5 * h);
+            let across = find::near(image, [u, v], args.radius_px() + 0.5 * w);
+            let down = find::near(image, [u, v], args.radius_px() + 0.5 * h);
             let bad = |e: NoFinding| CommandError::BadInput(format!("--near: {e}"));
             let (across, down) = (across.map_err(bad)?, down.map_err(bad)?);
             Window {

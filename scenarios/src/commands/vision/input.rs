@@ -2,21 +2,31 @@
 
 use std::io::Read;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use rover_cameras::{Camera, StereoPair};
-use rover_vision::Image8;
+use rover_files::FileError;
+use rover_vision::{Image8, picture};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::commands::CommandError;
-use crate::commands::camera::files::load_reported;
+use crate::commands::camera::files::{Loaded, check_one_frame, load_reported};
 use crate::output::Output;
 
 /// Reads all of a file; `-` is standard input.
 fn bytes(path: &Path) -> Result<Vec<u8>, CommandError> {
-    let refuse = |e: std::io::Error| CommandError::BadInput(format!("{}: {e}", path.display()));
+    let refuse = |e: std::io::Error| {
+        let e = FileError::from(e);
+        CommandError::BadInput(format!("{}: {e}", path.display()))
+    };
     if path == Path::new("-") {
+        static IS_READ: AtomicBool = AtomicBool::new(false);
+        if IS_READ.swap(true, Ordering::Relaxed) {
+            let why = "- is given twice: expected standard input for one file only";
+            return Err(CommandError::BadInput(why.into()));
+        }
         let mut all = Vec::new();
         std::io::stdin().read_to_end(&mut all).map_err(refuse)?;
         return Ok(all);
@@ -29,10 +39,14 @@ fn text(path: &Path) -> Result<String, CommandError> {
         .map_err(|_| CommandError::BadInput(format!("{}: not a text in UTF-8", path.display())))
 }
 
-/// Reads an image.
-pub fn image(path: &Path) -> Result<Image8, CommandError> {
-    Image8::decode(&bytes(path)?)
-        .map_err(|e| CommandError::BadInput(format!("{}: {e}", path.display())))
+/// Reads an image; says on standard error what a person should know about how it became grey.
+pub(in crate::commands) fn image(path: &Path) -> Result<Image8, CommandError> {
+    let decoded = picture::decode(&bytes(path)?)
+        .map_err(|e| CommandError::BadInput(format!("{}: {e}", path.display())))?;
+    for note in &decoded.notes {
+        eprintln!("rover: {}: {note}", path.display());
+    }
+    Ok(decoded.image)
 }
 
 /// Reads a TOML file of rules; the defaults without one.
@@ -49,7 +63,10 @@ pub fn toml_file<T: DeserializeOwned>(path: &Path) -> Result<T, CommandError> {
 /// Reads a camera model of any format that `rover camera` reads. A file without an image size takes
 /// that of `image`; another size than the image's is refused.
 pub fn camera(path: &Path, image: &Image8) -> Result<Camera, CommandError> {
-    let loaded = load_reported(path)?;
+    of_image(load_reported(path)?, image)
+}
+
+fn of_image(loaded: Loaded, image: &Image8) -> Result<Camera, CommandError> {
     let refuse =
         |e: &dyn std::fmt::Display| CommandError::BadInput(format!("{}: {e}", loaded.name));
     let size = [image.width_px, image.height_px];
@@ -70,14 +87,16 @@ pub fn camera(path: &Path, image: &Image8) -> Result<Camera, CommandError> {
     Ok(camera)
 }
 
-/// Reads both models of a stereo pair.
+/// Reads both models of a stereo pair, which must be given in one frame.
 pub fn pair(
     models: (&Path, &Path),
     images: (&Image8, &Image8),
 ) -> Result<StereoPair, CommandError> {
+    let (left, right) = (load_reported(models.0)?, load_reported(models.1)?);
+    check_one_frame(&left, &right)?;
     let pair = StereoPair {
-        left: camera(models.0, images.0)?,
-        right: camera(models.1, images.1)?,
+        left: of_image(left, images.0)?,
+        right: of_image(right, images.1)?,
     };
     pair.validate()
         .map_err(|e| CommandError::BadInput(e.to_string()))?;

@@ -9,6 +9,7 @@ use rover_vision::{
 };
 use serde::Serialize;
 
+use super::doubt::Matches;
 use super::input;
 use crate::commands::{CommandError, Exit};
 use crate::output::Output;
@@ -74,6 +75,7 @@ impl PairArgs {
 ///
 /// Columns u_px,v_px in; ur_px,vr_px,x_m,y_m,z_m,score,status out, in the frame of the camera
 /// models. Nothing is rectified: the true epipolar curve is searched, and a local plane fitted.
+/// Pictures that seem exchanged or unrelated are told.
 #[derive(Clone, Debug, clap::Args)]
 pub struct MatchArgs {
     #[command(flatten)]
@@ -84,37 +86,81 @@ pub struct MatchArgs {
     /// Where the table of matches goes; `-` is standard output
     #[arg(long, value_name = "CSV", default_value = "-")]
     out: PathBuf,
-    /// Overwrites an output that exists
+    /// Writes how many pixels have a match, and warnings, as JSON; `-` is standard output
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Overwrites outputs that exist
     #[arg(long)]
     force: bool,
+}
+
+#[derive(Serialize)]
+struct MatchReport {
+    pixels: u64,
+    matched: u64,
+    /// What speaks against the pictures: exchanged, or of two scenes.
+    warnings: Vec<String>,
 }
 
 const MATCH_COLUMNS: [&str; 6] = ["ur_px", "vr_px", "x_m", "y_m", "z_m", "score"];
 
 /// Runs `rover vision match`.
 pub fn run_match(args: &MatchArgs) -> Result<Exit, CommandError> {
+    let json = args
+        .json
+        .as_deref()
+        .map(|path| Output::open(path, args.force))
+        .transpose()?;
+    if json == Some(Output::Stdout) && args.out.as_os_str() == "-" {
+        return Err(CommandError::BadInput(
+            "--out and --json are both standard output, expected a file for one of them".into(),
+        ));
+    }
     let mut rules: MatchRules = input::rules(args.pair.rules.as_deref())?;
     args.pair.limit(&mut rules);
     rules.validate().map_err(CommandError::BadInput)?;
     let table = Table::open(&args.pixels, &["u_px", "v_px"])?;
     let loaded = args.pair.load()?;
     let mut out = TableWriter::create(&args.out, args.force, &MATCH_COLUMNS)?;
+    let mut matches = Matches::default();
     for row in table {
-        let answer = row?
-            .array::<2>()
-            .and_then(|[u, v]| matched(&loaded, Vector2::new(u, v), &rules));
+        let answer = row?.array::<2>().and_then(|[u, v]| {
+            let pixel = Vector2::new(u, v);
+            matched(&loaded, pixel, &rules, &mut matches)
+        });
         out.answer(answer)?;
         if out.is_closed() {
             break;
         }
     }
+    let (matched, refused) = out.counts();
     out.finish()?;
+    let Loaded { pair, left, right } = &loaded;
+    let warning = matches.doubt(pair, (left, right), &rules);
+    if let Some(warning) = &warning {
+        eprintln!("rover: warning: {warning}");
+    }
+    if let Some(json) = json {
+        let report = MatchReport {
+            pixels: matched + refused,
+            matched,
+            warnings: warning.into_iter().collect(),
+        };
+        input::write_json(&json, &report)?;
+    }
     Ok(Exit::Done)
 }
 
-fn matched(loaded: &Loaded, pixel: Vector2<f64>, rules: &MatchRules) -> Result<[f64; 6], String> {
+fn matched(
+    loaded: &Loaded,
+    pixel: Vector2<f64>,
+    rules: &MatchRules,
+    matches: &mut Matches,
+) -> Result<[f64; 6], String> {
     let Loaded { pair, left, right } = loaded;
-    let found = match_point(left, right, pair, &pixel, rules).map_err(|e| e.to_string())?;
+    let found = match_point(left, right, pair, &pixel, rules);
+    matches.add(pixel, found.as_ref().err());
+    let found = found.map_err(|e| e.to_string())?;
     let seen = pair
         .triangulate(&pixel, &found.right_px)
         .map_err(|e| e.to_string())?;
