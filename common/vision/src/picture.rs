@@ -91,10 +91,18 @@ pub fn decode(bytes: &[u8]) -> Result<Decoded, ImageError> {
     let mut limits = image::Limits::default();
     limits.max_image_width = Some(MAX_SIDE_PX);
     limits.max_image_height = Some(MAX_SIDE_PX);
-    reader.limits(limits);
-    let mut decoder = reader.into_decoder().map_err(|e| decode(&e))?;
-    let orientation = decoder.orientation().map_err(|e| decode(&e))?;
-    let mut picture = DynamicImage::from_decoder(decoder).map_err(|e| decode(&e))?;
+    reader.limits(limits.clone());
+    let mut decoder = reader.into_decoder().map_err(|e| refusal(&e))?;
+    let orientation = decoder.orientation().map_err(|e| refusal(&e))?;
+    // What a header claims is not taken for granted before the pixels are there.
+    let (claimed, (width_px, height_px)) = (decoder.total_bytes(), decoder.dimensions());
+    limits.reserve(claimed).map_err(|_| {
+        decode(&format!(
+            "{width_px} x {height_px} px of its colours need {claimed} bytes, expected at most {}",
+            limits.max_alloc.unwrap_or(u64::MAX)
+        ))
+    })?;
+    let mut picture = DynamicImage::from_decoder(decoder).map_err(|e| refusal(&e))?;
     picture.apply_orientation(orientation);
     let mut notes = Vec::new();
     if orientation != Orientation::NoTransforms {
@@ -120,6 +128,16 @@ pub fn decode(bytes: &[u8]) -> Result<Decoded, ImageError> {
     };
     let image = Image8::from_raw(width_px, height_px, pixels)?;
     Ok(Decoded { image, notes })
+}
+
+/// What the decoder says, in words of our own where the data are cut off.
+fn refusal(error: &image::ImageError) -> ImageError {
+    ImageError::Decode(match error {
+        image::ImageError::IoError(e) if e.kind() == std::io::ErrorKind::UnexpectedEof => {
+            "the data are cut off".into()
+        }
+        other => other.to_string(),
+    })
 }
 
 fn eight_of_sixteen(value: u16) -> u8 {
@@ -235,12 +253,20 @@ mod tests {
     fn damaged_and_foreign_data_are_refused_with_what_is_expected() {
         let mut png = encode_png(&Image8::from_raw(5, 3, vec![7; 15]).unwrap()).unwrap();
         png.truncate(40);
+        let mut bmp = Vec::new();
+        image::codecs::bmp::BmpEncoder::new(&mut bmp)
+            .write_image(&[7; 45], 5, 3, ExtendedColorType::Rgb8)
+            .unwrap();
         for (data, part) in [
             (&b"GIF89a......"[..], "GIF data, expected PNG, PNM"),
             (b"II*\0....", "TIFF data, expected"),
             (b"hello", "do not begin as a picture, expected"),
             (b"", "no data, expected"),
-            (&png, "not a readable picture"),
+            (&png, "not a readable picture: the data are cut off"),
+            (&bmp[..bmp.len() - 20], "the data are cut off"),
+            (b"P5\n5 3\n255\n...", "the data are cut off"),
+            // Headers alone, of 1.6 GB.
+            (b"P6\n16384 16384\n65535\n", "need 1610612736 bytes"),
         ] {
             let refusal = decode(data).unwrap_err().to_string();
             assert!(refusal.contains(part), "{refusal}");

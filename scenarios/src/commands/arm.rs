@@ -72,7 +72,8 @@ pub struct IkArgs {
     /// Table of targets; `-` is standard input
     #[arg(value_name = "TARGETS.csv")]
     pub targets: PathBuf,
-    /// All branches (samples of them where they are a continuum), one row each, with the number of the target in a first column `row`
+    /// All branches (samples of them where they are a continuum), one row each, with the number of
+    /// the target in a first column `row`
     #[arg(long)]
     pub all: bool,
     /// Targets are whole poses

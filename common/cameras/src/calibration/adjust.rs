@@ -231,23 +231,40 @@ impl<'a> Adjustment<'a> {
         all
     }
 
-    /// Covariance of the cameras' parameters, the poses of the board left free.
-    pub(super) fn covariance(&self, rig: &Rig) -> Option<DMatrix<f64>> {
+    /// Covariance of the cameras' parameters, the poses of the board left free, or the parameter
+    /// that is determined least where there is none; nothing where a corner has no image.
+    pub(super) fn covariance(&self, rig: &Rig) -> Option<Result<DMatrix<f64>, usize>> {
         let hessian = self.normal(rig)?.hessian;
         let n = rig.camera_n();
         // Scaled to a unit diagonal, so that units do not decide what is singular.
         let scale = hessian.diagonal().map(|d| 1.0 / d.sqrt());
+        if let Some(i) = (0..n).find(|i| !scale[*i].is_finite()) {
+            return Some(Err(i));
+        }
         let mut scaled = hessian;
         for i in 0..scaled.nrows() {
             for j in 0..scaled.ncols() {
                 scaled[(i, j)] *= scale[i] * scale[j];
             }
         }
-        let inverse = scaled.cholesky()?.inverse();
-        Some(DMatrix::from_fn(n, n, |i, j| {
+        let Some(found) = scaled.clone().cholesky() else {
+            return Some(Err(loosest(scaled, n)));
+        };
+        let inverse = found.inverse();
+        Some(Ok(DMatrix::from_fn(n, n, |i, j| {
             inverse[(i, j)] * scale[i] * scale[j]
-        }))
+        })))
     }
+}
+
+/// Of the first `n` unknowns the one that takes the largest part in the direction that a singular
+/// matrix leaves open.
+fn loosest(matrix: DMatrix<f64>, n: usize) -> usize {
+    let found = matrix.symmetric_eigen();
+    let open = found.eigenvectors.column(found.eigenvalues.imin());
+    (0..n)
+        .max_by(|a, b| open[*a].abs().total_cmp(&open[*b].abs()))
+        .unwrap_or(0)
 }
 
 impl Problem for Adjustment<'_> {

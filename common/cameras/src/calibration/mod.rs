@@ -202,7 +202,7 @@ pub enum CalibrationError {
         views: [usize; 2],
     },
     /// Two cameras never saw the board together.
-    #[error("no view shows the board to both cameras")]
+    #[error("no view that can be used shows the board to both cameras")]
     NoCommonView,
     /// A view's content cannot be used.
     #[error("view {view}: {reason}")]
@@ -273,6 +273,8 @@ const ITERATIONS: u32 = 100;
 const ROUNDS: usize = 8;
 /// Largest relative standard deviation of a focal length that counts as determined.
 const MAX_FOCAL_SIGMA: f64 = 0.1;
+/// Largest standard deviation of a turn between the cameras that counts as determined, radians.
+const MAX_TURN_SIGMA_RAD: f64 = 0.1;
 
 /// Calibrates one camera or a pair from what they saw of a board.
 ///
@@ -334,26 +336,36 @@ fn check(sizes_px: &[[u32; 2]], views: &[BoardView]) -> Result<(), CalibrationEr
         }
     }
     check_pairs(views)?;
+    enough(views, |camera, found| CalibrationError::TooFewViews {
+        camera,
+        found,
+        expected: MIN_VIEWS,
+    })
+}
+
+/// Whether views show enough different placements of the board to every camera, and one to all;
+/// `too_few` names the camera and what it sees.
+fn enough(
+    views: &[BoardView],
+    too_few: impl Fn(usize, usize) -> CalibrationError,
+) -> Result<(), CalibrationError> {
     let repeats = repeats(views);
-    for camera in 0..sizes_px.len() {
+    for camera in 0..views.first().map_or(0, Vec::len) {
         let found = views
             .iter()
             .zip(&repeats)
             .filter(|(v, repeats)| !v[camera].is_empty() && repeats.is_none())
             .count();
         if found < MIN_VIEWS {
-            return Err(CalibrationError::TooFewViews {
-                camera,
-                found,
-                expected: MIN_VIEWS,
-            });
+            return Err(too_few(camera, found));
         }
     }
     let common = |v: &BoardView| v.iter().all(|points| !points.is_empty());
-    if !views.iter().any(common) {
-        return Err(CalibrationError::NoCommonView);
+    if views.iter().any(common) {
+        Ok(())
+    } else {
+        Err(CalibrationError::NoCommonView)
     }
-    Ok(())
 }
 
 fn not_settled(adjustment: &Adjustment, iterations: u32) -> CalibrationError {
@@ -367,20 +379,43 @@ fn not_settled(adjustment: &Adjustment, iterations: u32) -> CalibrationError {
 /// Whether the views that still count are as many as a calibration needs.
 fn enough_left(views: &[BoardView], adjustment: &Adjustment) -> Result<(), CalibrationError> {
     let dropped = adjustment.dropped();
-    for camera in 0..views[0].len() {
-        let seen = |n: &usize| !views[*n][camera].is_empty() && !dropped.contains(n);
-        let left = (0..views.len()).filter(seen).count();
-        if left < MIN_VIEWS {
-            return Err(CalibrationError::Inconsistent {
-                camera,
-                views: views.len(),
-                left,
-                expected: MIN_VIEWS,
-                dropped,
-            });
-        }
+    let is_kept = |(n, _): &(usize, &BoardView)| !dropped.contains(n);
+    let kept: Vec<BoardView> = views
+        .iter()
+        .enumerate()
+        .filter(is_kept)
+        .map(|(_, view)| view.clone())
+        .collect();
+    let too_few = |camera: usize, left: usize| CalibrationError::Inconsistent {
+        camera,
+        views: views.len(),
+        left,
+        expected: MIN_VIEWS,
+        dropped: dropped.clone(),
+    };
+    if kept.is_empty() {
+        return Err(too_few(0, 0));
     }
-    Ok(())
+    enough(&kept, too_few)
+}
+
+/// The standard deviation of a parameter as a share of the largest that counts as determined;
+/// infinite for one that is not a number.
+fn looseness(parameter: &Parameter) -> f64 {
+    let Parameter { name, value, sigma } = parameter;
+    let limit = if name.contains(".f") {
+        MAX_FOCAL_SIGMA * value
+    } else if name.contains(".turn") {
+        MAX_TURN_SIGMA_RAD
+    } else {
+        f64::MAX
+    };
+    let loose = sigma / limit;
+    if loose.is_finite() {
+        loose
+    } else {
+        f64::INFINITY
+    }
 }
 
 fn finish(
@@ -397,19 +432,22 @@ fn finish(
     };
     let covariance = adjustment
         .covariance(&rig)
-        .ok_or_else(|| undetermined(0, f64::INFINITY))?;
-    let mut parameters = Vec::with_capacity(names.len());
-    for (i, (name, value)) in names.iter().zip(&values).enumerate() {
-        let sigma = covariance[(i, i)].sqrt();
-        let loose = name.contains(".f") && !(sigma <= MAX_FOCAL_SIGMA * value);
-        if !sigma.is_finite() || loose {
-            return Err(undetermined(i, sigma));
-        }
-        parameters.push(Parameter {
+        .ok_or_else(|| not_settled(adjustment, 0))?
+        .map_err(|i| undetermined(i, f64::INFINITY))?;
+    let parameters: Vec<Parameter> = names
+        .iter()
+        .zip(&values)
+        .enumerate()
+        .map(|(i, (name, value))| Parameter {
             name: name.clone(),
             value: *value,
-            sigma,
-        });
+            sigma: covariance[(i, i)].sqrt(),
+        })
+        .collect();
+    let loose: Vec<f64> = parameters.iter().map(looseness).collect();
+    let loosest = (0..loose.len()).max_by(|a, b| loose[*a].total_cmp(&loose[*b]));
+    if let Some(i) = loosest.filter(|i| loose[*i] > 1.0) {
+        return Err(undetermined(i, parameters[i].sigma));
     }
     let cameras = rig.cameras(sizes_px);
     for camera in &cameras {

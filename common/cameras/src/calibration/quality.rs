@@ -144,8 +144,9 @@ fn still(a: &[BoardPoint], b: &[BoardPoint]) -> bool {
     moved_px(a, b).is_some_and(|px| px <= SAME_PLACEMENT_PX)
 }
 
-/// For every view the earlier one that it repeats: the board stands still ([`SAME_PLACEMENT_PX`])
-/// in every camera that sees it, and the same cameras do.
+/// For every view the first one that it repeats: the board stands still ([`SAME_PLACEMENT_PX`])
+/// in every camera that sees it, and the same cameras do. Only views that repeat none themselves
+/// are repeated, so that a board that is moved slowly shows several placements.
 pub fn repeats(views: &[BoardView]) -> Vec<Option<usize>> {
     let same = |a: &BoardView, b: &BoardView| {
         a.len() == b.len()
@@ -154,9 +155,13 @@ pub fn repeats(views: &[BoardView]) -> Vec<Option<usize>> {
                 .zip(b)
                 .all(|(p, q)| (p.is_empty() && q.is_empty()) || still(p, q))
     };
-    (0..views.len())
-        .map(|n| (0..n).find(|first| same(&views[n], &views[*first])))
-        .collect()
+    let mut all: Vec<Option<usize>> = Vec::with_capacity(views.len());
+    for view in views {
+        let mut firsts = (0..all.len()).filter(|n| all[*n].is_none());
+        let first = firsts.find(|n| same(view, &views[*n]));
+        all.push(first);
+    }
+    all
 }
 
 /// Refuses views that cannot both be true, whatever the cameras.

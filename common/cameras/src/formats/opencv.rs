@@ -14,7 +14,7 @@
 use super::lens::{Lens, LensCamera};
 use super::pose::rotation;
 use super::ros::{pinhole, polynomial};
-use super::yaml::{self, all_finite, list, wrong};
+use super::yaml::{self, list, wrong};
 use super::{FormatError, MAX_BYTES, shown};
 use nalgebra::{Isometry3, Matrix3, Translation3};
 use serde::Deserialize;
@@ -104,19 +104,7 @@ struct Matrix {
 
 impl Matrix {
     fn numbers(&self, field: &str, expected: &[usize]) -> Result<&[f64], FormatError> {
-        let n = self.data.len();
-        if self.rows.checked_mul(self.cols) != Some(n) {
-            return Err(wrong(
-                field,
-                format_args!("{n} numbers of data"),
-                format!("{} x {} as its rows and cols say", self.rows, self.cols),
-            ));
-        }
-        if !expected.contains(&n) {
-            let expected = yaml::counts(expected);
-            return Err(wrong(field, format_args!("{n} numbers"), expected));
-        }
-        all_finite(field, &self.data)?;
+        yaml::check_matrix(field, Some((self.rows, self.cols)), &self.data, expected)?;
         Ok(&self.data)
     }
 }
@@ -191,8 +179,11 @@ impl File {
 
     /// Takes the first camera's axes to the second's, if the file says so.
     fn second_from_first(&self) -> Result<Option<Isometry3<f64>>, FormatError> {
-        let (Some(r), Some(t)) = (&self.turn, &self.shift) else {
-            return Ok(None);
+        let (r, t) = match (&self.turn, &self.shift) {
+            (None, None) => return Ok(None),
+            (Some(r), Some(t)) => (r, t),
+            (Some(_), None) => return Err(wrong("T", "nothing", "the shift that goes with R")),
+            (None, Some(_)) => return Err(wrong("R", "nothing", "the turn that goes with T")),
         };
         let turn = Matrix3::from_row_slice(r.numbers("R", &[9])?);
         let t = t.numbers("T", &[3])?;
@@ -207,7 +198,17 @@ impl File {
         number: Option<usize>,
         choice: &Choice,
     ) -> Result<Option<Isometry3<f64>>, FormatError> {
-        let pose = match (number, self.second_from_first()?, choice.second_from_first) {
+        if let Some(unit_m) = choice.unit_m
+            && !(unit_m.is_finite() && unit_m > 0.0)
+        {
+            return Err(wrong("--unit-m", unit_m, "a number above 0"));
+        }
+        // Of a camera alone, R and T are not looked at.
+        let here = match number {
+            Some(_) => self.second_from_first()?,
+            None => None,
+        };
+        let pose = match (number, here, choice.second_from_first) {
             (Some(2), Some(_), Some(_)) => {
                 return Err(wrong(
                     "R, T",

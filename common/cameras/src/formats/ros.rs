@@ -14,7 +14,7 @@
 
 use super::lens::{Lens, LensCamera};
 use super::pose::rotation;
-use super::yaml::{self, all_finite, list, number, wrong};
+use super::yaml::{self, list, number, wrong};
 use super::{FormatError, shown};
 use nalgebra::{Isometry3, Matrix3, Translation3, UnitQuaternion};
 use serde::de::{MapAccess, SeqAccess, Visitor};
@@ -138,25 +138,8 @@ impl<'de> Deserialize<'de> for Matrix {
 impl Matrix {
     /// The numbers, if they are as many as the shape says and as `expected` allows.
     fn numbers(&self, field: &str, expected: &[usize]) -> Result<&[f64], FormatError> {
-        let data = &self.data;
-        if let Some((rows, cols)) = self.shape
-            && rows.checked_mul(cols) != Some(data.len())
-        {
-            return Err(wrong(
-                field,
-                format_args!("{} numbers of data", data.len()),
-                format!("{rows} x {cols} as its rows and cols say"),
-            ));
-        }
-        if !expected.contains(&data.len()) {
-            return Err(wrong(
-                field,
-                format_args!("{} numbers", data.len()),
-                yaml::counts(expected),
-            ));
-        }
-        all_finite(field, data)?;
-        Ok(data)
+        yaml::check_matrix(field, self.shape, &self.data, expected)?;
+        Ok(&self.data)
     }
 }
 

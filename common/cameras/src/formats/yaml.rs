@@ -7,7 +7,8 @@ use serde::de::DeserializeOwned;
 const MAX_DEPTH: usize = 12;
 
 /// Reads one YAML document; a mark that ends it (`---` as `ros2 topic echo` prints it, or `...`) may
-/// follow, and comments behind it. A second document is refused. Aliases, which can make a short text long, are refused.
+/// follow, and comments behind it. A second document is refused, and so are aliases, which can make
+/// a short text long.
 pub(super) fn read<T: DeserializeOwned>(text: &str) -> Result<T, FormatError> {
     if text.len() > MAX_BYTES {
         return Err(FormatError::TooLong { found: text.len() });
@@ -89,6 +90,30 @@ pub(super) fn all_finite(field: &str, numbers: &[f64]) -> Result<(), FormatError
         None => Ok(()),
         Some(x) => Err(wrong(field, x, "finite numbers")),
     }
+}
+
+/// Refuses the numbers of a matrix that are not finite, not as many as one of `expected` or not as
+/// many as its rows and cols, if it has these, say.
+pub(super) fn check_matrix(
+    field: &str,
+    shape: Option<(usize, usize)>,
+    data: &[f64],
+    expected: &[usize],
+) -> Result<(), FormatError> {
+    let n = data.len();
+    if let Some((rows, cols)) = shape
+        && rows.checked_mul(cols) != Some(n)
+    {
+        return Err(wrong(
+            field,
+            format_args!("{n} numbers of data"),
+            format!("{rows} x {cols} as its rows and cols say"),
+        ));
+    }
+    if !expected.contains(&n) {
+        return Err(wrong(field, format_args!("{n} numbers"), counts(expected)));
+    }
+    all_finite(field, data)
 }
 
 /// A field with the wrong content.

@@ -71,6 +71,21 @@ fn one_placement_given_often_counts_once() {
 }
 
 #[test]
+fn a_board_moved_slowly_shows_several_placements() {
+    let pair = paper_pair();
+    let first = whole(views(&pair, 30, 0.1, 13, 0.6), 1).remove(0);
+    let moved = |px: f64| -> BoardView {
+        let mut view = first.clone();
+        view.iter_mut()
+            .flatten()
+            .for_each(|corner| corner.pixel_px.x += px);
+        view
+    };
+    let slow = [moved(0.0), moved(0.4), moved(0.8), moved(1.2)];
+    assert_eq!(repeats(&slow), [None, Some(0), None, Some(2)]);
+}
+
+#[test]
 fn pictures_that_cannot_both_be_true_are_named() {
     let pair = paper_pair();
     let views = whole(views(&pair, 40, 0.1, 14, 0.6), 8);

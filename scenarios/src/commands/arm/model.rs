@@ -20,7 +20,8 @@ pub struct ModelArgs {
     /// URDF: link that the arm stands on; the only root if not given
     #[arg(long, value_name = "LINK")]
     pub base: Option<String>,
-    /// URDF: link whose origin is the tool point; the only end of an arm of 4 to 7 joints if not given
+    /// URDF: link whose origin is the tool point; if not given the only end of an arm of 4 to 7
+    /// joints, refused where this arm has other ends
     #[arg(long, value_name = "LINK")]
     pub tip: Option<String>,
     /// URDF: approach axis in the tip link; its z axis if not given (info; ik without --pose)

@@ -75,7 +75,7 @@ impl About {
     /// The rules of conversion: the two models shall agree from `near_m` on, m.
     pub(super) fn rules(&self, near_m: f64) -> Result<ConversionRules, CommandError> {
         let limit_px = self.limit_px;
-        if limit_px >= 0.0 && near_m > 0.0 && near_m.is_finite() {
+        if [limit_px, near_m].iter().all(|x| *x > 0.0 && x.is_finite()) {
             return Ok(ConversionRules { limit_px, near_m });
         }
         Err(CommandError::BadInput(format!(
@@ -171,12 +171,6 @@ pub(super) fn load(
             let why = format!("{option} is for an OpenCV stereo file");
             return Err(bad(&name, &why));
         }
-    }
-    if let Some(unit_m) = about.unit_m
-        && !(unit_m.is_finite() && unit_m > 0.0)
-    {
-        let why = format!("--unit-m {unit_m}: expected a number above 0");
-        return Err(CommandError::BadInput(why));
     }
     let (mut notes, mut may_be_left) = (Vec::new(), false);
     let (mut file, fidelity) = match format {
@@ -314,14 +308,22 @@ fn unconverted(name: &str, error: &ConversionError) -> CommandError {
     let ConversionError::TooFar { worst_px, .. } = error else {
         return bad(name, error);
     };
-    // The error rounded up to two digits.
-    let unit = 10_f64.powf(worst_px.log10().floor() - 1.0);
-    let enough = (worst_px / unit).ceil() * unit;
-    let digits = usize::from(enough < 10.0) + usize::from(enough < 1.0);
+    let enough = rounded_up(*worst_px);
     bad(
         name,
-        &format!("{error}; `rover camera convert --limit-px {enough:.digits$}` accepts that"),
+        &format!("{error}; `rover camera convert --limit-px {enough}` accepts that"),
     )
+}
+
+/// A number above 0, rounded up to two digits.
+fn rounded_up(x: f64) -> String {
+    let place = 1 - x.log10().floor() as i32;
+    let steps = (x * 10_f64.powi(place)).ceil();
+    if place <= 0 {
+        format!("{:.0}", steps * 10_f64.powi(-place))
+    } else {
+        format!("{:.*}", place as usize, steps / 10_f64.powi(place))
+    }
 }
 
 fn fidelity<T>(found: &Conversion<T>) -> Fidelity {
@@ -459,4 +461,25 @@ pub(super) fn json(value: &impl serde::Serialize) -> Result<String, CommandError
     let mut text = serde_json::to_string_pretty(value).context("report as JSON")?;
     text.push('\n');
     Ok(text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::rounded_up;
+
+    #[test]
+    fn a_limit_that_is_suggested_is_above_what_was_found_and_short() {
+        for (x, expected) in [
+            (0.0123, "0.013"),
+            (0.000_999_9, "0.00100"),
+            (0.21, "0.21"),
+            (7.31, "7.4"),
+            (12.3, "13"),
+            (123.4, "130"),
+        ] {
+            let found = rounded_up(x);
+            assert_eq!(found, expected);
+            assert!(found.parse().is_ok_and(|limit: f64| limit >= x), "{found}");
+        }
+    }
 }
