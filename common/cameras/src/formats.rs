@@ -24,8 +24,9 @@ pub mod text;
 pub mod toml;
 mod yaml;
 
-pub use conversion::{Conversion, ConversionError, ConversionRules, Family};
+pub use conversion::{Conversion, ConversionError, ConversionRules};
 pub use lens::{Lens, LensCamera};
+pub use lens_fit::Family;
 pub use text::{read_text, write_text};
 pub use toml::{read_toml, write_toml};
 

@@ -11,7 +11,7 @@
 
 use super::fit::{Fitting, Samples, back_px, nudged, samples, worst_px};
 use super::lens::{Lens, LensCamera};
-use super::lens_fit::{lens_fitting, lens_start, start_of};
+use super::lens_fit::{Family, lens_fitting, lens_start, start_of};
 use crate::error::Short;
 use crate::radial::Radial;
 use crate::{Cahv, Cahvor, Cahvore, Camera, CameraError, CameraModel};
@@ -35,19 +35,6 @@ impl Default for ConversionRules {
             near_m: 0.5,
         }
     }
-}
-
-/// The lens models that other tools read.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Family {
-    /// k1, k2, p1, p2 (Kalibr `radtan`).
-    RadialTangential,
-    /// k1, k2, p1, p2, k3 (ROS `plumb_bob`).
-    PlumbBob,
-    /// k1, k2, p1, p2, k3, k4, k5, k6 (ROS `rational_polynomial`).
-    Rational,
-    /// k1, k2, k3, k4 of the angle (ROS `equidistant`, OpenCV fisheye, Kalibr `equidistant`).
-    Equidistant,
 }
 
 /// A converted camera and how well it stands for the original.

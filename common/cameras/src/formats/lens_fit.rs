@@ -1,11 +1,23 @@
 //! The parameters of a pinhole camera with a lens, for fitting it to a camera of the CAHV family:
 //! where to begin, and the camera that they make.
 
-use super::conversion::Family;
 use super::fit::{Fitting, nudged};
 use super::lens::{Lens, LensCamera};
 use crate::{Camera, CameraModel};
 use nalgebra::{DVector, Isometry3, Translation3, UnitQuaternion, Vector3};
+
+/// The lens models that other tools read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Family {
+    /// k1, k2, p1, p2 (Kalibr `radtan`).
+    RadialTangential,
+    /// k1, k2, p1, p2, k3 (ROS `plumb_bob`).
+    PlumbBob,
+    /// k1, k2, p1, p2, k3, k4, k5, k6 (ROS `rational_polynomial`).
+    Rational,
+    /// k1, k2, k3, k4 of the angle (ROS `equidistant`, OpenCV fisheye, Kalibr `equidistant`).
+    Equidistant,
+}
 
 impl Family {
     /// What the families are called in messages.

@@ -4,8 +4,8 @@ use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
 use super::PlateSearch;
 use super::lanes::{LANES, Lane, add_products, each, ramp, total};
-use super::locate::Candidate;
-use super::model::{self, LocalMap, Part, Picture, level_sigma};
+use super::local_map::{Candidate, LocalMap};
+use super::model::{self, Part, Picture, level_sigma};
 use crate::image::Image8;
 use crate::ncc::SearchImage;
 

@@ -6,7 +6,7 @@
 
 use std::sync::OnceLock;
 
-use super::model::LocalMap;
+use super::local_map::LocalMap;
 use crate::plate::{Disc, Saddle};
 
 /// Pixels that are worked out together.

@@ -4,18 +4,11 @@
 use nalgebra::{Matrix2, Vector2};
 
 use super::align::refine;
-use super::model::{self, LocalMap, Part, Picture, level_sigma};
+use super::local_map::{Candidate, LocalMap};
+use super::model::{self, Part, Picture, level_sigma};
 use super::{NotFound, PlateSearch};
 use crate::image::Image8;
 use crate::ncc::{ScoreMap, SearchImage, Template, score_map};
-
-/// A place where the plate may be: the map around the centre of the searched part, and the NCC of
-/// its appearance there.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Candidate {
-    pub map: LocalMap,
-    pub score: f64,
-}
 
 /// Least side of a part's image at the coarse level, px of that level.
 const MIN_COARSE_SIDE: f64 = 12.0;

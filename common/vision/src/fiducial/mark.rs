@@ -8,7 +8,7 @@
 use nalgebra::{SMatrix, SVector, Vector2};
 
 use super::lanes::MarkModel;
-use super::model::LocalMap;
+use super::local_map::LocalMap;
 use super::window::{EdgeDistance, GREY, MIDDLE_DN, Window};
 use super::{DetectionRules, PointKind};
 use crate::image::Image8;
@@ -290,7 +290,7 @@ fn gauss_newton_step(
 ) -> Option<Step> {
     let window = Window {
         model: mark.model(map, blur_px)?,
-        edge: EdgeDistance::new(mark, map),
+        edge: EdgeDistance::new(mark.layout, map),
         kind: mark.kind,
         centre,
         reach_px,

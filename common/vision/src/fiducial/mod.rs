@@ -8,6 +8,7 @@
 
 mod align;
 mod lanes;
+mod local_map;
 mod locate;
 mod mark;
 mod model;

@@ -2,9 +2,9 @@
 
 use nalgebra::{Isometry3, Vector2, Vector3};
 
-use super::locate::Candidate;
+use super::local_map::Candidate;
+use super::local_map::LocalMap;
 use super::mark::{Mark, MarkFit, PointFault, fit};
-use super::model::LocalMap;
 use super::pose::{Sighting, solve_pose};
 use super::{DetectionRules, NotFound, PlateObservation, PlateSearch, PointKind, PointObservation};
 use crate::image::Image8;

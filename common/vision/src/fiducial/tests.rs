@@ -425,7 +425,7 @@ fn a_glance_gives_the_place_and_score_of_the_full_search() {
         let pose = synthetic::facing_pose(&rig.pair.left, pixel, 0.6, tilt, 1.0, 0.3);
         let image = rig.image(&rig.picture(0, &pose, 40 + case), 1.5, &mut rng);
         let search = rig.search(0, Translation3::new(0.004, -0.003, 0.0) * pose, 16.0);
-        let map = model::LocalMap::new(
+        let map = local_map::LocalMap::new(
             search.camera,
             &(Translation3::new(0.004, -0.003, 0.0) * pose),
             &Vector3::zeros(),

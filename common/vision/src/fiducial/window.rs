@@ -4,9 +4,9 @@ use nalgebra::Vector2;
 
 use super::PointKind;
 use super::lanes::{LANES, Lane, MarkModel, add_products, each, larger, ramp, smaller, total};
-use super::mark::Mark;
-use super::model::LocalMap;
+use super::local_map::LocalMap;
 use crate::image::Image8;
+use crate::plate::PlateLayout;
 
 /// Width of the strip along the plate's border that the surroundings blur into, px.
 const EDGE_STRIP_PX: f64 = 1.2;
@@ -172,7 +172,8 @@ pub(super) struct EdgeDistance {
 }
 
 impl EdgeDistance {
-    pub fn new(mark: &Mark, map: &LocalMap) -> Self {
+    /// With a map around the mark's middle.
+    pub fn new(layout: &PlateLayout, map: &LocalMap) -> Self {
         let row = |i: usize| {
             let r = map.inverse.row(i);
             (r[0] as f32, r[1] as f32, r.norm())
@@ -184,10 +185,10 @@ impl EdgeDistance {
                 [xu / xn as f32, xv / xn as f32],
                 [yu / yn as f32, yv / yn as f32],
             ],
-            at: [scale(mark.at_m.x, xn), scale(mark.at_m.y, yn)],
+            at: [scale(map.centre_m.x, xn), scale(map.centre_m.y, yn)],
             half: [
-                scale(mark.layout.half_width_m, xn),
-                scale(mark.layout.half_height_m, yn),
+                scale(layout.half_width_m, xn),
+                scale(layout.half_height_m, yn),
             ],
         }
     }
@@ -208,7 +209,6 @@ mod tests {
     use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
     use super::*;
-    use crate::plate::PlateLayout;
 
     fn maps() -> Vec<(PlateLayout, usize, LocalMap)> {
         let camera = &crate::synthetic::pair().left;
@@ -274,10 +274,9 @@ mod tests {
         let pixels = (0..640 * 480).map(|i| (i * 7 % 251) as u8).collect();
         let image = Image8::from_raw(640, 480, pixels).unwrap();
         for (layout, index, map) in maps() {
-            let mark = Mark::new(&layout, index).unwrap();
             let window = Window {
                 model: model(&layout, index, &map, 0.7),
-                edge: EdgeDistance::new(&mark, &map),
+                edge: EdgeDistance::new(&layout, &map),
                 kind: if index == 11 {
                     PointKind::Saddle
                 } else {

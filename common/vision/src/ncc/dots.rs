@@ -3,7 +3,6 @@
 #[cfg(target_arch = "x86_64")]
 use super::{
     LANES,
-    masked::total,
     narrow::{self, POSITIONS, WIDE_POSITIONS},
 };
 use super::{SearchImage, Template};
@@ -45,6 +44,18 @@ pub(super) fn dots(template: &Template, image: &SearchImage, x: usize, y: usize,
     }
     #[cfg(not(target_arch = "x86_64"))]
     dots_plain(template, image, start, out);
+}
+
+/// The sum of four numbers.
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+pub(super) fn total(x: std::arch::x86_64::__m128i) -> i32 {
+    use std::arch::x86_64::{_mm_add_epi32, _mm_cvtsi128_si32, _mm_shuffle_epi32};
+    // SAFETY: SSE2 belongs to every x86-64.
+    unsafe {
+        let half = _mm_add_epi32(x, _mm_shuffle_epi32(x, 0b01_00_11_10));
+        _mm_cvtsi128_si32(_mm_add_epi32(half, _mm_shuffle_epi32(half, 0b10_11_00_01)))
+    }
 }
 
 /// The same without vector instructions.

@@ -3,6 +3,8 @@
 //! The same formula on the same whole numbers as in [`super::score`]; running sums over the mask's
 //! runs, as used there, pay off from some positions in a row on.
 
+#[cfg(target_arch = "x86_64")]
+use super::dots::total;
 use super::small::{Extent, Scale};
 use super::{SearchImage, Template, VALUE_LIMIT};
 
@@ -137,18 +139,6 @@ unsafe fn sums_avx2(image: &SearchImage, template: &Template, start: usize) -> [
             );
             total(_mm_add_epi32(rest[i], _mm_add_epi32(low, high)))
         })
-    }
-}
-
-/// The sum of four numbers.
-#[cfg(target_arch = "x86_64")]
-#[inline(always)]
-pub(super) fn total(x: std::arch::x86_64::__m128i) -> i32 {
-    use std::arch::x86_64::{_mm_add_epi32, _mm_cvtsi128_si32, _mm_shuffle_epi32};
-    // SAFETY: SSE2 belongs to every x86-64.
-    unsafe {
-        let half = _mm_add_epi32(x, _mm_shuffle_epi32(x, 0b01_00_11_10));
-        _mm_cvtsi128_si32(_mm_add_epi32(half, _mm_shuffle_epi32(half, 0b10_11_00_01)))
     }
 }
 
