@@ -102,9 +102,9 @@ impl From<PageError> for CommandError {
 impl From<OutputError> for CommandError {
     fn from(error: OutputError) -> Self {
         match error {
-            OutputError::Exists { .. } => Self::BadInput(error.to_string()),
+            _ if error.is_bad_input() => Self::BadInput(error.to_string()),
             // Its text ends with what the system said; as a chain it would say so twice.
-            OutputError::File { .. } => Self::Internal(anyhow::Error::msg(error.to_string())),
+            _ => Self::Internal(anyhow::Error::msg(error.to_string())),
         }
     }
 }

@@ -25,6 +25,17 @@ pub enum OutputError {
     },
 }
 
+impl OutputError {
+    /// Whether another name or path would do.
+    #[must_use]
+    pub fn is_bad_input(&self) -> bool {
+        match self {
+            Self::Exists { .. } => true,
+            Self::File { source, .. } => source.is_wrong_path(),
+        }
+    }
+}
+
 /// Where a command writes its data.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Output {

@@ -123,10 +123,11 @@ pub enum TableError {
 impl TableError {
     /// Whether the user's input is at fault, rather than the system or the program.
     pub fn is_bad_input(&self) -> bool {
-        !matches!(
-            self,
-            Self::Output(OutputError::File { .. }) | Self::Answer { .. }
-        )
+        match self {
+            Self::Output(error) => error.is_bad_input(),
+            Self::Answer { .. } => false,
+            _ => true,
+        }
     }
 }
 

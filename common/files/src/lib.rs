@@ -33,6 +33,22 @@ impl FileError {
     pub fn is_missing(&self) -> bool {
         self.source.kind() == ErrorKind::NotFound
     }
+
+    /// Whether another path would do: nothing is there, or something else, or no permission is
+    /// given; not that the machine has failed.
+    #[must_use]
+    pub fn is_wrong_path(&self) -> bool {
+        matches!(
+            self.source.kind(),
+            ErrorKind::NotFound
+                | ErrorKind::IsADirectory
+                | ErrorKind::NotADirectory
+                | ErrorKind::AlreadyExists
+                | ErrorKind::PermissionDenied
+                | ErrorKind::ReadOnlyFilesystem
+                | ErrorKind::InvalidFilename
+        )
+    }
 }
 
 /// The failure of reading a file.
@@ -111,6 +127,9 @@ mod tests {
         ] {
             assert_eq!(found, expected);
         }
+        let wrong = FileError::writing(fs::create_dir_all(&file).unwrap_err());
+        let full = FileError::writing(ErrorKind::StorageFull.into());
+        assert!(wrong.is_wrong_path() && !full.is_wrong_path());
         let text = reading(fs::read_to_string(&file).unwrap_err());
         assert!(text.starts_with("not a text in UTF-8"), "{text}");
         // EMFILE, for which there are no words of our own.

@@ -56,6 +56,9 @@ pub struct CampaignArgs {
 impl From<CampaignError> for CommandError {
     fn from(error: CampaignError) -> Self {
         match error {
+            CampaignError::File { ref source, .. } if source.is_wrong_path() => {
+                Self::BadInput(error.to_string())
+            }
             CampaignError::File { .. } => Self::Internal(error.into()),
             CampaignError::Other { .. } | CampaignError::Broken { .. } => {
                 Self::BadInput(error.to_string())

@@ -153,7 +153,7 @@ fn because(fault: &Option<(usize, PointFault)>) -> String {
 }
 
 /// Checks that hold for every search, and the map of the plate around its centre.
-fn prepare(image: &Image8, search: &PlateSearch) -> Result<model::LocalMap, NotFound> {
+fn prepare(image: &Image8, search: &PlateSearch) -> Result<local_map::LocalMap, NotFound> {
     let bad = |e: &dyn std::fmt::Display| NotFound::BadInput(e.to_string());
     image.validate().map_err(|e| bad(&e))?;
     search.layout.validate().map_err(|e| bad(&e))?;
@@ -171,7 +171,7 @@ fn prepare(image: &Image8, search: &PlateSearch) -> Result<model::LocalMap, NotF
         )));
     }
     let pose = &search.predicted_camera_frame_from_plate;
-    model::LocalMap::new(search.camera, pose, &Vector3::zeros())
+    local_map::LocalMap::new(search.camera, pose, &Vector3::zeros())
 }
 
 /// Finds the plate and measures its points.
@@ -196,7 +196,7 @@ pub fn find_saddle(image: &Image8, search: &PlateSearch) -> Result<PointObservat
     let centre = Vector3::new(saddle.x_m, saddle.y_m, 0.0);
     if centre != Vector3::zeros() {
         let pose = &search.predicted_camera_frame_from_plate;
-        map = model::LocalMap::new(search.camera, pose, &centre)?;
+        map = local_map::LocalMap::new(search.camera, pose, &centre)?;
     }
     locate::locate(image, search, &map, model::Part::Saddle, &|candidate| {
         points::measure_saddle(image, search, candidate)

@@ -65,7 +65,9 @@ pub fn of_disparities(
         .disparity(left, right, rules)
         .ok()?;
     let pixels = (0..other.height_px).flat_map(|v| (0..other.width_px).map(move |u| (u, v)));
-    let answered = pixels.filter(|(u, v)| other.at(*u, *v).is_some()).count();
+    // counted as `found` is: what lies before infinity
+    let answers = |&(u, v): &(u32, u32)| other.at(u, v).is_some_and(|d| d + shift_px > 0.0);
+    let answered = pixels.filter(answers).count();
     let back = answered as f64 / (f64::from(other.width_px) * f64::from(other.height_px));
     if back >= GOOD_DISPARITIES.max(TIMES * found) {
         return Some(format!(
