@@ -212,15 +212,21 @@ impl Plot {
                 x.text(t, false)
             );
         }
+        // beside the axis if it fits there
+        let (y_label_at, anchor) = if self.y_label.chars().count() <= 7 {
+            (LEFT - 7.0, "end")
+        } else {
+            (2.0, "start")
+        };
         let _ = write!(
             out,
             "<path d=\"M{LEFT} {TOP}V{bottom}H{right}\" class=\"axis\" fill=\"none\"/>\
              <text x=\"{}\" y=\"{}\" text-anchor=\"middle\">{}</text>\
-             <text x=\"{}\" y=\"{}\" text-anchor=\"end\">{}</text>",
+             <text x=\"{}\" y=\"{}\" text-anchor=\"{anchor}\">{}</text>",
             (LEFT + right) / 2.0,
             HEIGHT - 6.0,
             self.x_label,
-            LEFT - 7.0,
+            y_label_at,
             TOP - 9.0,
             self.y_label
         );
