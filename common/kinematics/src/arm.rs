@@ -96,7 +96,7 @@ fn chain_m(rows: &[DhRow], tilts_rad: &[f64]) -> f64 {
             }
         }
         let now = length(&places);
-        if !(best - now > CHAIN_GAIN_M) {
+        if best - now <= CHAIN_GAIN_M {
             return best.min(now);
         }
         best = now;
